@@ -19,7 +19,7 @@ from radiotwin.links.checks import (
     refuse_empty_levels,
 )
 from radiotwin.links.measurements import Measurements
-from radiotwin.propagation.laws import channel_named
+from radiotwin.propagation.laws import channel_named, check_fit_data
 from radiotwin.propagation.laws.image_paths import ImagePaths
 from radiotwin.propagation.laws.path_kriging import PathKriging
 from radiotwin.propagation.laws.published import PublishedLaw
@@ -113,6 +113,8 @@ def fit_twin(measurements: Measurements | pd.DataFrame | Path | str, scene: Scen
                           "device: it needs torch (`pip install 'radiotwin[nn]'`)", stacklevel=2)
         of_anchors = np.isin(links.device, sorted(links.anchors))
         geometry, level_db, limit_db = anchors_links(links)
+        if model == AUTO and len(geometry):  # even if the best model does not use the map
+            check_fit_data(geometry, level_db, needs_los=True)
         held_out = HeldOut.of(geometry, links.flight[of_anchors], level_db, limit_db, seed,
                               models)
         if model == AUTO:

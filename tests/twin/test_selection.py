@@ -5,6 +5,7 @@ import pytest
 
 from radiotwin.errors import BadInput, MissingPackage
 from radiotwin.links import LinkGeometry
+from radiotwin.links.measurements import Measurements
 from radiotwin.propagation.laws.registry import encode_channel
 from radiotwin.twin import fit_twin
 from radiotwin.twin.selection import HeldOut, standard_error
@@ -96,3 +97,12 @@ def test_without_torch_the_best_of_the_other_models_predicts_and_locates(small_s
         twin = fit_twin(flown, small_scene)
     assert list(HeldOut.kept(twin.provenance).rmse_db) == ["log_distance", "segmented_log_distance", "kriging"]
     assert "located_by" not in twin.provenance and np.isfinite(twin.device_m).all()
+
+
+def test_a_map_that_hides_every_link_is_refused_even_if_a_law_without_a_map_is_the_best(small_scene, flown):
+    devices = flown.devices[flown.devices["role"] == "anchor"].reset_index(drop=True)
+    of_anchors = Measurements(flown.table[flown.table["device"].isin(devices["device"])].reset_index(drop=True), devices)
+    at_m = small_scene.device_m[flown.is_anchor][of_anchors.device_index]
+    hidden = of_anchors.select(~small_scene.city.line_of_sight(at_m, of_anchors.receiver_m))
+    with pytest.raises(BadInput, match="all links NLoS"):
+        fit_twin(hidden, small_scene)
