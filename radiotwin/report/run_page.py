@@ -13,6 +13,7 @@ from radiotwin.report.folders import Run
 from radiotwin.report.html import Table, read_picture, write_page
 from radiotwin.report.labels import attribution, name_label, place_words, source_label
 from radiotwin.report.viewer_data import device_layer, marks, viewer_data
+from radiotwin.twin.law import LAW
 from radiotwin.twin.selection import HeldOut
 
 MAX_NAMED = 4  # devices in a sentence
@@ -103,12 +104,11 @@ def _channel_words(run: Run) -> str:
 
 
 def _law_table(run: Run) -> Table | None:
-    """Return the fitted law of the twin's channel; None where it has none."""
-    law = run.twin.params if run.twin is not None and not run.closeloop else None
-    if law is None or law.empty:
+    """Return the law that `fit` recorded in the twin, with its intervals; else None."""
+    if run.twin is None or run.closeloop or not run.twin.provenance.get(LAW):
         return None
-    return Table(("links", "parameter", "value", "low", "high", "unit"),
-                 law.to_numpy(dtype=object).tolist(), "with 90 % intervals", 2)
+    law = run.twin.params
+    return Table(list(law.columns), law.to_numpy(dtype=object).tolist(), "with 90 % intervals", 2)
 
 
 def _located_table(run: Run) -> Table | None:
