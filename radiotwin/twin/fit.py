@@ -19,8 +19,9 @@ from radiotwin.links.checks import (
     refuse_empty_levels,
 )
 from radiotwin.links.measurements import Measurements
-from radiotwin.propagation.laws import channel_named, check_fit_data
+from radiotwin.propagation.laws import ChannelModel, channel_named, check_fit_data
 from radiotwin.propagation.laws.image_paths import ImagePaths
+from radiotwin.propagation.laws.log_distance import SegmentedLogDistance
 from radiotwin.propagation.laws.path_kriging import PathKriging
 from radiotwin.propagation.laws.published import PublishedLaw
 from radiotwin.propagation.laws.segmented_nn import SegmentedNN, require_torch
@@ -101,16 +102,19 @@ def fit_twin(measurements: Measurements | pd.DataFrame | Path | str, scene: Scen
     if links.has_boresights:
         warnings.warn("azimuth_deg and tilt_deg are used by close-loop alone where no column "
                       "antenna names the file of a pattern", stacklevel=2)
-    held_out, locator = None, None
+    held_out: HeldOut | None = None
+    locator: type[ChannelModel] | None = None
     if compare or model == AUTO:
         models: tuple[str, ...] = CHEAP
+        locates: type[ChannelModel] = SegmentedNN
         try:
             require_torch()
-            locator = SegmentedNN if model == AUTO else None
         except MissingPackage:
             models = tuple(name for name in CHEAP if name != SegmentedNN.name)
-            warnings.warn(f"{SegmentedNN.name} is not among the models compared, and locates no "
-                          "device: it needs torch (`pip install 'radiotwin[nn]'`)", stacklevel=2)
+            locates = SegmentedLogDistance
+            warnings.warn(f"{SegmentedNN.name} is not among the models compared, and "
+                          f"{locates.name} locates devices in its place: it needs torch "
+                          "(`pip install 'radiotwin[nn]'`)", stacklevel=2)
         of_anchors = np.isin(links.device, sorted(links.anchors))
         geometry, level_db, limit_db = anchors_links(links)
         if model == AUTO and len(geometry):  # even if the best model does not use the map
@@ -119,6 +123,7 @@ def fit_twin(measurements: Measurements | pd.DataFrame | Path | str, scene: Scen
                               models)
         if model == AUTO:
             channel = channel_named(UNTRIED if held_out is None else held_out.best)
+            locator = locates
     if along_paths:
         fit = fit_along_paths if channel is ImagePaths else fit_over_wrong_map
         twin = fit(links, scene, seed, start, executor)
