@@ -236,14 +236,8 @@ def _lora(name: str, title: str, source: str, payload: str, place: str,
           ) -> tuple[Format, Format]:
     """Return the formats of a LoRa network's uplinks, for nodes with and without a position.
 
-    Args:
-        name: of the format for nodes without a position.
-        title: of the network.
-        source: of the description.
-        payload: prefix of the decoded payload's columns.
-        place: prefix of the columns of a gateway's position.
-        settings: further settings of the import.
-        columns: columns of `level`, `snr`, `time`, `node` and `gateway`.
+    `payload` and `place` are prefixes of columns: of the decoded payload, and of a gateway's
+    position. `columns` are those of `level`, `snr`, `time`, `node` and `gateway`.
     """
     node, gateway = str(columns.pop("node")), str(columns.pop("gateway"))
     places = {each: f"{place}{each}" for each in ("latitude", "longitude", "altitude")}

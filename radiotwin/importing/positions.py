@@ -155,16 +155,10 @@ def _names_by_time(source: Source, links: pd.DataFrame, table: pd.DataFrame | No
 
 def _names_by_place(source: Source, links: pd.DataFrame, device_m: np.ndarray,
                 place_m: float) -> np.ndarray:
-    """Rename devices that have several positions in the log to `NAME@1`, `NAME@2`, ….
+    """Return the device of each link (n,), with several positions of one as `NAME@1`, ….
 
-    Args:
-        source: for messages.
-        links: n links.
-        device_m: (n, 3) position of each link's device [m].
-        place_m: positions within this distance of the first one are one place [m].
-
-    Returns:
-        (n,) names; places are numbered as they occur.
+    Positions (n, 3) [m] within `place_m` of the first one are one place; places are numbered as
+    they occur.
     """
     names = links["device"].to_numpy(dtype=object, copy=True)
     filled_m = np.nan_to_num(device_m)
@@ -195,13 +189,8 @@ def _read_sites(path: str, key: str, settings: Settings, names: Collection[str])
     """Read a table of positions of devices or receivers.
 
     Several rows of one device are its positions over time, with columns `since` and optionally
-    `until` in ISO 8601. They become devices `NAME@1`, `NAME@2`, ….
-
-    Args:
-        path: of the table, in any format of a log.
-        key: `device` or `receiver`.
-        settings: give the unit of lengths without one, and the reference system of x and y.
-        names: in the log.
+    `until` in ISO 8601. They become devices `NAME@1`, `NAME@2`, …. `key` is `device` or `receiver`,
+    and `names` are those in the log.
 
     Returns:
         the table, indexed by name, with projected x and y as latitude and longitude.
@@ -318,14 +307,8 @@ def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
 def _placeholder_fixes(receivers: pd.DataFrame, names: pd.Series) -> dict[str, np.ndarray]:
     """Find placeholder positions that a program wrote in place of a missing fix.
 
-    Such a position repeats to the last digit, far from all others of a moving receiver.
-
-    Args:
-        receivers: n positions, see `local_positions`.
-        names: (n,) receivers.
-
-    Returns:
-        position as text -> rows of the readings there.
+    Such a position repeats to the last digit, far from all others of a moving receiver. Returns the
+    rows of the readings at each, by the position as text.
     """
     if "latitude" not in receivers:
         return {}

@@ -318,15 +318,8 @@ def unheard_devices(table: pd.DataFrame, level_db: np.ndarray,
                     keep: np.ndarray) -> tuple[np.ndarray, str]:
     """Find devices that were never detected on at least `MIN_LINKS` links, and may be off.
 
-    A device with fewer links may be one position of a moving device: its blanks are kept.
-
-    Args:
-        table: n measurements.
-        level_db: (n,) [dB]; NaN = not detected.
-        keep: (n,) bool, links that are used so far.
-
-    Returns:
-        a mask (n,) of their links, and the reason to leave them out.
+    A device with fewer links may be one position of a moving device: its blanks are kept. Arguments
+    and result are those of `uninformative_receivers`, for one reason.
     """
     end, names = pd.factorize(table["device"], sort=True)
     links, heard = (np.bincount(end[rows], minlength=len(names))

@@ -206,13 +206,10 @@ def _fields(position_m: np.ndarray, trends: list[Trend], first: np.ndarray, seco
 
 def _nearest(gamma: np.ndarray, pairs: np.ndarray, fields: np.ndarray,
              lengths_m: np.ndarray) -> float:
-    """Fit nugget and sill for each length, and return the length [m] of the best fit.
+    """Fit nugget and sill for each length (k,), and return the length [m] of the best fit.
 
-    Args:
-        gamma: (b,) empirical semivariances in bins.
-        pairs: (b,) number of pairs in them.
-        fields: (1 + k, b) semivariances of white noise, and of a field of each length.
-        lengths_m: (k,) [m].
+    `gamma` (b,) are empirical semivariances of `pairs` (b,) pairs in bins; `fields` (1 + k, b) are
+    those of white noise, and of a field of each length.
     """
     # Bins are dependent: beyond some hundreds of pairs, more make a bin no more certain.
     weight = np.sqrt(np.minimum(pairs, 500)) / np.maximum(gamma, 0.05 * gamma.max(initial=1e-9))

@@ -311,14 +311,9 @@ def match_learnt_law(names: Sequence[str], declared: Declared, learnt: Declared,
 
 def _with_powers(names: Sequence[str], radios: tuple[Radio, ...], known_dbm: list[float],
                  whose: str, scene: Scene | None) -> tuple[tuple[Radio, ...], list[str]]:
-    """Fill in missing transmit powers, with a note.
+    """Fill in missing transmit powers, with a note: the scene's power, else a median [dBm].
 
-    Args:
-        names: of k devices.
-        radios: k radios.
-        known_dbm: powers whose median is assumed, unless the scene declares a power [dBm].
-        whose: what that median is called in the note.
-        scene: None: no scene.
+    `whose` is what the median of `known_dbm` is called in the note.
     """
     usual_dbm = float(np.median(known_dbm))
     if scene is not None and scene.config.radio.declares_power:

@@ -180,12 +180,8 @@ def _limit_nats(tried_db: np.ndarray, read_db: np.ndarray, mean_db: np.ndarray,
                 scale_db: np.ndarray, as_one: float) -> tuple[np.ndarray, float]:
     """Return the log-likelihood [nats] of candidate limits (k,), and that of no limit.
 
-    Args:
-        tried_db: (k,) candidate limits [dB].
-        read_db: readings in ascending order [dB].
-        mean_db: (m,) predicted levels of the blanks [dB].
-        scale_db: (m,) scale of their errors [dB].
-        as_one: number of links that count as one.
+    Readings are in ascending order [dB]; `mean_db` and `scale_db` (m,) are the predictions of the
+    blanks; `as_one` is the number of links that count as one.
     """
     readings, blanks = len(read_db), len(mean_db)
     mean_db = np.round(mean_db / BIN_DB) * BIN_DB

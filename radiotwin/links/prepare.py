@@ -181,18 +181,9 @@ def _ground_m(scene: Scene, device_m: np.ndarray, receiver_m: np.ndarray) -> np.
 def _join(measurements: Measurements, table: pd.DataFrame, scene: Scene | None,
           level_db: np.ndarray, receiver_m: np.ndarray, device_m: np.ndarray, device: np.ndarray,
           kept_devices: np.ndarray, notes: list[str]) -> Links:
-    """Make links from selected rows and devices, and estimate their limits of detection.
+    """Make links from n selected rows and k selected devices, and estimate their limits.
 
-    Args:
-        measurements: all of them.
-        table: the n selected rows.
-        scene: None: no scene.
-        level_db: (n,) [dB]; NaN = not detected.
-        receiver_m: (n, 3) [m].
-        device_m: (k, 3) positions of the selected devices [m]; NaN: unknown.
-        device: (n,) index of each link's device among these.
-        kept_devices: (k,) rows of the selected devices in `measurements.devices`.
-        notes: so far.
+    `kept_devices` (k,) are rows of `measurements.devices`, and `device` (n,) are indices of these.
     """
     receiver, receiver_names = pd.factorize(table["receiver"], sort=True)
     flight, flight_names = pd.factorize(table["flight"])

@@ -194,10 +194,9 @@ def _then(first: Convert, second: Convert) -> Convert:
 
 
 def misspelt(name: str, known: Iterable[str]) -> str | None:
-    """Return the known name of which a name is a misspelling; None if there is none.
+    """Return the known name that a name misspells by one letter (two in a long one), else None.
 
-    One letter may be wrong, or two in a long name; digits must be equal. Names are in the form of
-    `_plain`.
+    Digits must be equal. Names are in the form of `_plain`.
     """
     if len(name) < _MIN_LETTERS:
         return None
@@ -498,11 +497,10 @@ def _numbers(table: SiteTable, quantity: str, convert: Convert | None, length_un
 
 
 def _number_with_unit(text: str, name: str, quantity: str, crs: bool) -> tuple[float, float]:
-    """Read a cell with a unit, such as `30 m`, `100'`, `20 W`.
+    """Read a cell with a unit, such as `30 m`, `100'`, `20 W`; NaN, NaN if that fails.
 
-    Returns:
-        the number in the quantity's unit, or NaN; and the number in the unit of the column's name,
-        if the cell repeats that, or NaN. Both are NaN for a cell that cannot be read.
+    Returns the number in the quantity's unit, or NaN and the number in the unit of the column's
+    name if the cell repeats that.
     """
     found = _WITH_UNIT.fullmatch(text) if len(text) <= _DMS_CHARACTERS else None
     nothing = (np.nan, np.nan)

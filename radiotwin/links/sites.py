@@ -59,17 +59,9 @@ def antenna_of(links: Links, device: int) -> list[int]:
 
 
 def relatives_of(links: Links, device: int, heard: set[int]) -> list[int]:
-    """Return detected devices with nearly the same paths to a receiver as a given device.
+    """Return up to `MAX_RELATIVES` detected devices with nearly the same paths as a given device.
 
-    They are the other devices of its antenna, else those of its mast.
-
-    Args:
-        links: with the positions and azimuths of all devices.
-        device: index.
-        heard: indices of the detected devices.
-
-    Returns:
-        at most `MAX_RELATIVES` indices.
+    They are the other devices of its antenna, else of its mast; `heard` are the detected ones.
     """
     others = ([other for other in group if other != device and other in heard]
               for group in (antenna_of(links, device), site_of(links, device)))
@@ -156,17 +148,10 @@ def inseparable_pairs(one: np.ndarray, other: np.ndarray) -> dict[int, int]:
 
 
 def inseparable_end(links: Links, end: str, members: set[int]) -> str | None:
-    """Return the other end if the error of a member cannot be separated from one of that end.
+    """Return the other end (device or receiver) if a member shares all its links with one there.
 
-    A member and one of the other end then share all their detected links.
-
-    Args:
-        links: n links.
-        end: `device` or `receiver`.
-        members: indices at that end.
-
-    Returns:
-        `receiver` or `device`, the other end; None if all errors can be separated.
+    The errors of the two cannot be separated. `members` are indices at `end`; only detected links
+    count. None: all errors can be separated.
     """
     other, heard = OTHER_END[end], np.isfinite(links.level_db)
     together = inseparable_pairs(getattr(links, end)[heard], getattr(links, other)[heard])
