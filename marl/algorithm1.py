@@ -197,7 +197,7 @@ class Campaign:
         """Return the mission to train in: in the twin, or in the truth where there is no twin."""
         if self.twin is None:
             return self.in_truth()
-        return twin_mission(self.scene, self.run, self.twin, self.known, self._measurements())
+        return twin_mission(self.scene, self.run, self.twin, self.known)
 
     def tell(self, learner: Learner) -> None:
         """Tell a learner that asks for it what the twin leaves open."""
@@ -387,21 +387,18 @@ class Reality:
         return pd.concat(tables, ignore_index=True)
 
 
-def twin_mission(scene: Scene, run: RunSettings, twin: Twin, known: Known,
-                 measurements: Measurements | None) -> Mission:
+def twin_mission(scene: Scene, run: RunSettings, twin: Twin, known: Known) -> Mission:
     """Return the mission in a twin.
 
     Args:
         scene: of the twin.
-        run: settings of the run.
+        run: settings of the run; `twin_shadowing` says how long errors of the map last.
         twin: it gives the map.
         known: positions that the UAVs know.
-        measurements: errors of the map last as long as their residuals say; None: for a slot.
     """
     radio_map = twin.radio_map(scene)
-    if measurements is not None and run.twin_shadowing == "fitted":
-        radio_map = with_shadowing(radio_map, twin, measurements, scene.config.gain_limit_db,
-                                   run.seed)
+    if run.twin_shadowing == "fitted":
+        radio_map = with_shadowing(radio_map, twin)
     return make_mission(scene, radio_map, known, run.assignment)
 
 

@@ -101,7 +101,7 @@ def train_in(seed: int, settings: dict) -> dict:
     run = RunSettings(algorithm="qmix", real_episodes=1, seed=seed, **{
         key: settings[key] for key in ("episodes", "flights", "planner_iterations")})
     learner = LearnerSettings.model_validate(settings["learner"])
-    result, inside = train_and_fly(reality, twin, run, learner, measured)
+    result, inside = train_and_fly(reality, twin, run, learner)
     if twin is not None:
         true = reality.mission(Known.truth(scene))
         result["fidelity"] = fidelity(true, inside, settings["replayed_flights"], seed)
@@ -109,8 +109,8 @@ def train_in(seed: int, settings: dict) -> dict:
     return result
 
 
-def train_and_fly(reality: Reality, twin: Twin | None, run: RunSettings, learner: LearnerSettings,
-                  measured: Measurements | None = None) -> tuple[dict[str, Any], Mission]:
+def train_and_fly(reality: Reality, twin: Twin | None, run: RunSettings,
+                  learner: LearnerSettings) -> tuple[dict[str, Any], Mission]:
     """Train and plan in a twin, or in the truth (None), and fly in the truth.
 
     Returns:
@@ -119,7 +119,7 @@ def train_and_fly(reality: Reality, twin: Twin | None, run: RunSettings, learner
     """
     known = Known.truth(reality.scene) if twin is None else Known.of(twin.devices)
     real = reality.mission(known)
-    inside = real if twin is None else twin_mission(reality.scene, run, twin, known, measured)
+    inside = real if twin is None else twin_mission(reality.scene, run, twin, known)
     trained, result = make_learner(run, learner, inside, 1), {}
     try:
         with progress(f"training, seed {run.seed}", total=run.episodes) as advance:
@@ -213,7 +213,7 @@ def train_with_towers(seed: int, settings: dict) -> dict:
     measured = _survey(scene, truth, 5, 1.0, seed)
     twin = _learnt(TRAINED_IN[settings["trained_in"]], seed, scene, measured)
     run = RunSettings(algorithm=settings["algorithm"], episodes=settings["episodes"], seed=seed,
-                      real_episodes=1, flights=16)
+                      real_episodes=1, flights=16, twin_shadowing="slot")
     reality = Reality(scene, truth, run.assignment, 0.0, seed)
     result = train_and_fly(reality, twin, run, PRESETS["fast"])[0]
     errors = {} if twin is None else _errors(twin, scene, truth)

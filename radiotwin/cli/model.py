@@ -368,19 +368,14 @@ def locate(
     from radiotwin.scene import Scene
     from radiotwin.twin import Twin
     from radiotwin.twin.localize.without_map import MIN_LINKS
-    from radiotwin.twin.locate import (
-        check_can_locate,
-        locate_devices,
-        position_errors,
-        read_truth,
-    )
+    from radiotwin.twin.locate import locate_devices, position_errors, read_truth
 
     require_suffix(out, ".csv", ".csv.gz")
     keep_inputs(out, measurements, devices or measurements.parent / "devices.csv", truth)
     keep_others(out, force, "device", "x_m", "y_m", "radius_m")
     known, world = Twin.load(twin), Scene.load(scene) if scene else None
     keep_inputs(out, *(world.files if world else []))
-    check_can_locate(known, world)  # before a file is read that may be large
+    known.require_map(world)  # before a file is read that may be large
     data = in_frame_of(world, read_measurements(measurements, devices), shift)
     true = read_truth(truth, known.origin or data.origin) if truth else None
     require_writable(out)

@@ -1,4 +1,4 @@
-"""The twin: fit, save, load, predict, map, locate."""
+"""Twin: fit to measurements, save and load, predict levels and maps, locate devices."""
 
 from radiotwin.twin.fit import fit_twin
 from radiotwin.twin.store import check_twin_target

@@ -1,4 +1,4 @@
-"""Comparison of channel models on held-out flights and on the whole truth map."""
+"""Compare channel models on held-out flights and on a truth map: `compare_models`."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -20,28 +20,27 @@ from radiotwin.scene import Scene
 from radiotwin.scene.footing import moved_outdoors
 from radiotwin.twin import Twin, fit_twin
 
-# Models that are compared unless others are named.
 DEFAULT_MODELS = ("log_distance", "segmented_log_distance", "segmented_nn", "kriging")
-# Published laws that `radiotwin compare` adds: nothing is fitted, so they cost only the search.
+# Published laws that `radiotwin compare` adds: they are not fitted, so only localisation takes time
 PUBLISHED_MODELS = ("tr36777_uma", "tr36777_umi", "al_hourani_urban", "p1411", "cost231_wi")
-WORKER_BYTES = 3 * 2**30  # of a process that fits a model
-CLASSES = ("all", "LoS", "NLoS")  # of links, as the tables name them
-LABELS = ("flight", "receiver", "device")  # columns of the predictions beside those of the models
+WORKER_BYTES = 3 * 2**30  # memory of a process that fits a model
+CLASSES = ("all", "LoS", "NLoS")  # classes of links in the tables
+LABELS = ("flight", "receiver", "device")  # columns of `Comparison.predictions` that label links
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Errors of several models on one data set.
+    """Errors of channel models on one data set.
 
     Attributes:
         scores: one row for each (model, against, positions, links): n, rmse_db, mae_db, bias_db.
-            `against` is `held-out flights` or `whole map`; `positions` is `estimated` (the twin as
-            it is) or `true` (the channel alone); `links` is all, LoS or NLoS by the true positions
-            where they are known.
+            `against` is `held-out flights` or `whole map`; `positions` is `estimated` (by the twin)
+            or `true` (errors of the channel only); `links` is all, LoS or NLoS at the true
+            positions.
         locations: one row for each (model, unknown device): error_m, credible_radius_m, located.
-        twins: the fitted twins by model.
-        predictions: held-out links with `measured_db`, `los` (1, 0, or NaN where the true position
-            is not known) and a column of predictions for each model.
+        twins: fitted twins by model.
+        predictions: held-out links with `measured_db`, `los` (1, 0, or NaN if the true position is
+            unknown) and a column of predictions for each model.
     """
 
     scores: pd.DataFrame
@@ -50,7 +49,7 @@ class Comparison:
     predictions: pd.DataFrame
 
     def tables(self) -> list[tuple[str, dict[str, str], list[list]]]:
-        """Return tables to show: (title, headings with their alignment, rows), scores first."""
+        """Return the tables to print: (title, headings with alignment, rows), scores first."""
         tables: list[tuple[str, dict[str, str], list[list]]] = []
         estimated = self.scores[self.scores["positions"] == "estimated"]
         for against, part in estimated.groupby("against", sort=False):
@@ -76,15 +75,15 @@ class Comparison:
         return tables
 
     def _label(self, model: str) -> str:
-        """Return a model's name, and that it was fitted to nothing where that is so."""
+        """Return a model's name, followed by "(no fit)" for a published law."""
         twin = self.twins.get(model)
         published = twin is not None and isinstance(twin.channel, PublishedLaw)
         return f"{model} (no fit)" if published else model
 
     def location_summary(self) -> pd.DataFrame:
-        """Return median, 90th percentile and worst position error [m] of each model.
+        """Return median, 90th percentile and largest position error of each model [m].
 
-        `devices` is how many it located, of those whose true position is known.
+        `devices` is the number of located devices with a known true position.
         """
         def summary(errors: pd.Series) -> pd.Series:
             return pd.Series({"devices": errors.count(), "median_m": errors.median(),
@@ -96,14 +95,12 @@ class Comparison:
 
 
 def _short(value: float) -> str:
+    """Format an error for a table; a dash for NaN."""
     return "–" if np.isnan(value) else f"{value:.2f}"
 
 
 def published_models(frequency_hz: float) -> tuple[str, ...]:
-    """Return names of the `PUBLISHED_MODELS` that hold at a frequency [Hz].
-
-    Those that are used with a warning near their range are among them.
-    """
+    """Return the `PUBLISHED_MODELS` that can be used at a frequency [Hz], some with a warning."""
     def holds(name: str) -> bool:
         law = channel_named(name)
         assert issubclass(law, PublishedLaw)
@@ -115,17 +112,17 @@ def published_models(frequency_hz: float) -> tuple[str, ...]:
 
 def split_flights(measurements: Measurements, held_out: int = 1
                   ) -> tuple[Measurements, Measurements]:
-    """Split the last flights from those before.
+    """Split measurements into training flights and held-out flights, the last ones.
 
     Args:
-        measurements: of several flights.
-        held_out: number of the last flights.
+        measurements: measurements of two flights or more.
+        held_out: number of held-out flights.
 
     Returns:
-        measurements to learn from, and measurements to judge on.
+        training measurements, and held-out measurements.
 
     Raises:
-        BadInput: fewer flights than it takes to learn from one and hold out the others.
+        BadInput: no flight would be left to learn from.
     """
     flights = measurements.flights
     if held_out < 1:
@@ -146,31 +143,30 @@ def compare_models(train: Measurements, test: Measurements, scene: Scene,
                    twins: dict[str, Twin] | None = None,
                    maps: dict[str, RadioMap] | None = None,
                    executor: Executor | None = None) -> Comparison:
-    """Fit every model to the same links and judge all of them on the same others.
+    """Fit every model to the same training links, and score all on the same held-out links.
 
     Args:
-        train: links to learn from.
-        test: links to judge on.
-        scene: where both were measured; its devices' true positions are used to judge, never to
-            learn.
-        truth: the whole map to judge on, too; None: there is none.
+        train: training links.
+        test: held-out links.
+        scene: scene of both; true positions of its devices are used for scores only.
+        truth: truth map for scores; None: none.
         seed: of all fits.
-        models: names, as for `fit_twin`.
-        twins: fitted already, judged beside the models, by the name that they get in the tables.
-        maps: made already, judged on the truth map.
-        executor: where the models are fitted; None: in this process.
-
-    Returns:
-        errors of all of them
+        models: names of channel models, see `fit_twin`.
+        twins: already fitted twins to score, too, by name in the tables.
+        maps: radio maps to score on the truth map, by name in the tables.
+        executor: runs the fits; None: this process.
 
     Raises:
-        BadInput: nothing detected to judge on, a truth of another scene, a twin or map with the
-            name of a model, or what `fit_twin` refuses.
+        BadInput: nothing was detected on held-out flights, the truth is of another scene, a twin or
+            map has the name of a model, or an error of `fit_twin`.
     """
     _check(test, scene, truth, twins or {})
-    _check_names([*(twins or {}), *(maps or {})], models)
+    for name in (*(twins or {}), *(maps or {})):
+        if name in {*models, *LABELS, "measured_db", "los"}:
+            raise BadInput(f"{name} is the name of a model or of a column in the tables, too; "
+                           "rename it, or give it from another folder")
     for twin in (twins or {}).values():
-        twin.require_map(scene)  # refuses before the others are fitted, which takes long
+        twin.require_map(scene)  # before the fits, which take long
     job = Job("comparing models", with_pieces(partial(_fit_model, train, scene, seed)),
               Resources(WORKER_BYTES, False))
     fitted = dict(zip(models, (executor or Executor()).run(job, models), strict=True))
@@ -193,17 +189,19 @@ def compare_models(train: Measurements, test: Measurements, scene: Scene,
                 scores += score_map(model, ideal.radio_map(scene), truth, positions="true")
         locations += _location_rows(model, twin, true_m)
     for name, candidate in (maps or {}).items():
-        assert truth is not None  # a map can be judged on nothing else
+        assert truth is not None  # maps are scored on the truth map only
         scores += score_map(name, candidate, truth)
     return Comparison(pd.DataFrame(scores), pd.DataFrame(locations), fitted, predictions)
 
 
 def _fit_model(train: Measurements, scene: Scene, seed: int, model: str) -> Twin:
+    """Fit a twin with a channel model, in a worker of `compare_models`."""
     return fit_twin(train, scene, model=model, seed=seed)
 
 
 def _check(test: Measurements, scene: Scene, truth: RadioMap | None,
            twins: dict[str, Twin]) -> None:
+    """Raise BadInput if held-out links, truth or twins cannot be compared."""
     if not np.isfinite(test.level_db).any():
         raise BadInput("nothing was detected on the held-out flights "
                        f"({', '.join(test.flights[:4])}), so no error can be computed; hold out "
@@ -216,25 +214,16 @@ def _check(test: Measurements, scene: Scene, truth: RadioMap | None,
                            f"{test.level_column}; they cannot be compared")
 
 
-def _check_names(others: list[str], models: tuple[str, ...]) -> None:
-    """Raise BadInput if what is judged beside the models would take the place of something."""
-    for name in others:
-        if name in {*models, *LABELS, "measured_db", "los"}:
-            raise BadInput(f"{name} is to be judged beside a model or a column of that name, and "
-                           "would take its place in the tables; rename it, or give it from another "
-                           "folder")
-
-
 def true_positions(scene: Scene,
                    measurements: Measurements) -> dict[str, tuple[float, float, float]]:
-    """Return the known positions of measured devices.
+    """Return the true positions of measured devices, as far as they are declared.
 
     Args:
-        scene: which declares devices.
-        measurements: which declare anchors; for these they have precedence.
+        scene: scene that declares devices.
+        measurements: measurements; their positions of anchors have precedence.
 
     Returns:
-        device -> (x, y, z) [m], for devices of the measurements only.
+        device -> (x, y, z) [m].
     """
     known = {d.device: (d.x_m, d.y_m, d.z_m) for d in scene.config.devices}
     known |= {row.device: (row.x_m, row.y_m, row.z_m) for row in measurements.devices.itertuples()
@@ -243,15 +232,15 @@ def true_positions(scene: Scene,
 
 
 def predict(twin: Twin, scene: Scene, measurements: Measurements) -> np.ndarray:
-    """Return the expected level of measured links, given that they are detected.
+    """Predict the levels of measured links, given that they are detected.
 
-    Only detected links can be compared with a prediction, and near the limit only the strong ones
-    were detected: the mean of all would lie below the mean of those, most for the model with the
-    largest standard deviation. So every model predicts the mean of what is detected.
+    Errors can be computed for detected links only, and near the limit of detection only the
+    strongest are detected. The unconditional mean would be biased, most for the model with the
+    largest standard deviation. So every model predicts the mean given detection.
 
     Args:
-        twin: predicts.
-        scene: that the twin needs for its map.
+        twin: twin that predicts.
+        scene: scene with the 3D map.
         measurements: n links.
 
     Returns:
@@ -284,12 +273,12 @@ def _moved(twin: Twin, position_m: dict[str, tuple[float, float, float]]) -> Twi
 
 def score_map(name: str, candidate: RadioMap, truth: RadioMap,
               positions: str = "estimated") -> list[dict]:
-    """Score a radio map against the truth, on the devices and positions of both.
+    """Score a radio map against a truth map, on the devices that both have.
 
     Args:
-        name: of the map in the rows.
-        candidate: map to judge.
-        truth: map on the same lattice.
+        name: name of the map in the rows.
+        candidate: map to score.
+        truth: truth map on the same lattice.
         positions: `estimated` or `true`, in the rows.
 
     Returns:
@@ -305,18 +294,17 @@ def score_map(name: str, candidate: RadioMap, truth: RadioMap,
             f"map {name} cannot be compared with the truth: devices {candidate.devices} on a "
             f"lattice of {candidate.gain_db.shape[1:]} positions, the truth has {truth.devices} on "
             f"{truth.gain_db.shape[1:]}; make both for the same scene")
-    ours, theirs = ([m.devices.index(device) for device in common] for m in (candidate, truth))
-    return _scores(name, "whole map", positions, truth.gain_db[theirs].astype(float).ravel(),
-                   comparable_db(candidate, truth)[ours].ravel(), truth.los[theirs].ravel())
+    rows, truth_rows = ([m.devices.index(device) for device in common] for m in (candidate, truth))
+    return _scores(name, "whole map", positions, truth.gain_db[truth_rows].astype(float).ravel(),
+                   comparable_db(candidate, truth)[rows].ravel(), truth.los[truth_rows].ravel())
 
 
 def comparable_db(candidate: RadioMap, truth: RadioMap) -> np.ndarray:
-    """Return a map's levels as they compare with the truth's detected links.
+    """Return a map's gains for comparison with detected links of a truth map.
 
     Args:
-        candidate: map; its mean given detection is taken where it has a standard deviation.
-        truth: map of single values, or with a standard deviation of its own: then the means are
-            compared as they are.
+        candidate: map; if it has a standard deviation, its mean given detection is used.
+        truth: truth map; if it has a standard deviation, too, the means are compared directly.
 
     Returns:
         (device, z, y, x) gain [dB]
@@ -329,10 +317,10 @@ def comparable_db(candidate: RadioMap, truth: RadioMap) -> np.ndarray:
 
 
 def _los(scene: Scene, true_m: dict, links: Measurements) -> np.ndarray:
-    """Return (n,) 1 with LoS, 0 without, NaN where the true position is unknown."""
+    """Return the line of sight (n,) of links at true positions: 1, 0, or NaN if unknown."""
     position_m = np.array([true_m.get(name, (np.nan,) * 3) for name in links.devices["device"]])
     placed = np.isfinite(position_m).all(axis=1)
-    position_m[placed] = moved_outdoors(scene.city, position_m[placed])  # as the twins have them
+    position_m[placed] = moved_outdoors(scene.city, position_m[placed])  # as in the twins
     device_m = position_m[links.device_index]
     los = np.full(len(device_m), np.nan)
     known = np.isfinite(device_m).all(axis=1)
@@ -342,7 +330,7 @@ def _los(scene: Scene, true_m: dict, links: Measurements) -> np.ndarray:
 
 def _scores(model: str, against: str, positions: str, measured_db: np.ndarray,
             predicted_db: np.ndarray, los: np.ndarray) -> list[dict]:
-    """Return a row of errors for each class of links, from (n,) levels and lines of sight."""
+    """Return RMSE, mean absolute error and bias of all links, LoS (`los` 1) and NLoS (0)."""
     rows = []
     usable = np.isfinite(measured_db) & np.isfinite(predicted_db)
     for links, mask in zip(CLASSES, (usable, usable & (los == 1), usable & (los == 0))):
@@ -358,6 +346,7 @@ def _scores(model: str, against: str, positions: str, measured_db: np.ndarray,
 
 
 def _location_rows(model: str, twin: Twin, true_m: dict) -> list[dict]:
+    """Return a row with the position error and radius of each unknown device."""
     rows = []
     for device in twin.devices:
         if device.role == "unknown":

@@ -1,4 +1,4 @@
-"""Fitting a twin to measurements, by any channel model."""
+"""fit_twin: fit a twin to measurements by any channel model."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ from radiotwin.twin.selection import AUTO, CHEAP, HELD_OUT, LOCATED_BY, UNTRIED,
 from radiotwin.twin.shadowing import MAP_ERRORS, MapErrors
 from radiotwin.twin.twin import Twin
 
-# Of more links, so many are fitted: what a model can use. Of 310,000 simulated links, whose errors
-# are independent, all give a map with the error of 30,000 (0.385 dB), and devices 0.04 to 0.3 m
-# nearer than 100,000, in 2.5 times the time; measured ones err alike where they are close together.
+# Most links that are fitted. With 310,000 simulated links, whose errors are independent, the map
+# has the error of 30,000 (0.385 dB), and devices are 0.04 to 0.3 m nearer than with 100,000, in 2.5
+# times the time; errors of neighbouring measured links are correlated.
 MAX_LINKS = 150_000
 HEIGHT_NEEDED = ("with a 3D map every position needs one. Fill it in, in metres above the ground "
                  "of the scene (about 1.5 for a phone in the hand), here or in the table for "
@@ -142,7 +142,7 @@ def fit_twin(measurements: Measurements | pd.DataFrame | Path | str, scene: Scen
 
 
 def _usable(measurements: Measurements) -> Measurements:
-    """Return the links without copies; raise BadInput where levels are empty or all equal."""
+    """Drop copies of links; raise BadInput if levels are empty or all equal."""
     refuse_empty_levels(measurements.level_db, measurements.level_column)
     copied = copied_rows(measurements.table)
     if not copied.any():
@@ -152,12 +152,12 @@ def _usable(measurements: Measurements) -> Measurements:
 
 
 def _thinned(measurements: Measurements, seed: int) -> Measurements:
-    """Return all links, or random ones of each device where there are too many."""
+    """Draw MAX_LINKS random links, evenly among devices, if there are more."""
     device = measurements.device_index
     if len(device) <= MAX_LINKS:
         return measurements
     links = np.bincount(device)
-    few, many = 1, len(device)  # a device; the first is possible, the second is not
+    few, many = 1, len(device)  # links of a device: the first fits into MAX_LINKS, the second not
     while many - few > 1:
         middle = (few + many) // 2
         fits = np.minimum(links, middle).sum() <= max(MAX_LINKS, len(links))
@@ -174,7 +174,7 @@ def _thinned(measurements: Measurements, seed: int) -> Measurements:
 
 
 def _check_heights(measurements: Measurements) -> None:
-    """Raise BadInput, with the row, where a height is empty: a 3D map needs it."""
+    """Raise BadInput with its row if a height of a receiver or measured device is empty."""
     empty = np.flatnonzero(measurements.table["receiver_z_m"].isna())
     if len(empty):
         raise BadInput(f"{measurements.files[0]}, row {empty[0] + 2}, column receiver_z_m: the "

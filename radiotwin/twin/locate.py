@@ -1,4 +1,4 @@
-"""Devices of unknown position in a file of measurements, located by a twin."""
+"""Locate devices of unknown position in new measurements by a fitted twin."""
 
 import warnings
 from collections.abc import Sequence
@@ -29,47 +29,34 @@ NOT_BY_PATHS = ("and following paths from every position where a device may be t
                 "locate uses its law of distance and line of sight alone. close-loop --base twin "
                 "makes one whose effects it uses, too, and fit --model paths locates devices "
                 "along paths")
-MAX_NAMED = 5  # receivers in a note
-MAX_PROBES = 2000  # links by which a channel's error scale is looked up
-MIN_WIDENING = 1.2  # of residuals, from which a file's links are unlike those learnt from
-
-
-def check_can_locate(twin: Twin, scene: Scene | None) -> None:
-    """Check that a twin can locate devices outside its own fit.
-
-    Args:
-        twin: made by `fit` or `close-loop`.
-        scene: the 3D map that devices are to be located with.
-
-    Raises:
-        BadInput: it was fitted with a map and none is given, or the other way round.
-    """
-    twin.require_map(scene)
+MAX_NAMED = 5  # receivers named in a note
+MAX_PROBES = 2000  # links at which a channel's standard deviation is sampled
+MIN_WIDENING = 1.2  # ratio of residuals to those in training above which radii are widened
 
 
 def locate_devices(measurements: Measurements | pd.DataFrame | Path | str, twin: Twin,
                    scene: Scene | Path | str | None = None) -> tuple[pd.DataFrame, list[str]]:
-    """Locate the devices of role unknown.
+    """Locate the devices of role unknown in new measurements.
 
     Args:
-        measurements: their links, and others; converted into the twin's frame where both say where
-            on the earth they lie.
+        measurements: links of these devices, and others; converted into the twin's frame if both
+            have a known origin.
         twin: made by `fit` or `close-loop`.
         scene: the 3D map, or its folder, if the twin was made with one; None: the twin's own.
 
     Returns:
-        a row a device: `device, x_m, y_m, radius_m` (of 90 % of the probability), `links`, and
-        `latitude_deg, longitude_deg` where the frame's origin is known; and notes on the data.
+        a row for each device: `device, x_m, y_m, radius_m` (90 % of the probability), `links`, and
+        `latitude_deg, longitude_deg` if the frame's origin is known; and notes on the data.
 
     Raises:
-        BadInput: a twin that cannot locate, no unknown device, links of another quantity than the
-            twin's, or nothing that can be used.
+        BadInput: the twin needs a map, or was made without one; no unknown device; another quantity
+            than the twin's; or no usable link.
     """
     if scene is None:
         scene = twin.scene if twin.channel.uses_map else None
     else:
         scene = Scene.of(scene)
-    check_can_locate(twin, scene)
+    twin.require_map(scene)
     measurements = in_known_frame(as_measurements(measurements, scene), twin.origin, "the twin")
     unknown = measurements.select(~measurements.is_anchor[measurements.device_index])
     unknown = replace(unknown, devices=unknown.devices[~unknown.is_anchor].reset_index(drop=True))
@@ -82,13 +69,13 @@ def locate_devices(measurements: Measurements | pd.DataFrame | Path | str, twin:
     links = prepare_links(unknown, scene, to_locate=True)
     declared, assumed = match_learnt_law(links.device_names, links.declared, twin.declared, scene)
     links = links.with_ends(declared=declared).with_notes(*assumed)
-    alone = twin.fitted.is_channel_alone or twin.channel.follows_paths
-    model = _by_channel(twin, links) if alone else twin.fitted.for_positions()
+    by_channel = twin.fitted.is_channel_alone or twin.channel.follows_paths
+    model = _by_channel(twin, links) if by_channel else twin.fitted.for_positions()
     strangers = [name for name in links.receiver_names if name not in model.receivers]
     notes = list(links.notes)
     if twin.channel.follows_paths:
         notes.append(f"the twin follows paths, {NOT_BY_PATHS}")
-    elif alone:
+    elif by_channel:
         notes.append("the twin is of `radiotwin fit`, which does not learn how far links of one "
                      "device err alike: the devices may be farther away than their radii say. "
                      "Radii of a twin of `radiotwin close-loop` allow for it")
@@ -109,19 +96,17 @@ def locate_devices(measurements: Measurements | pd.DataFrame | Path | str, twin:
                      f"{widening:.1f} times as large as those of the known devices that the twin "
                      "was learnt from: receivers or surroundings have changed since, or what was "
                      "learnt holds less where these devices are; radii are that much wider")
-        found = [replace(each, credible_radius_m=widening * each.credible_radius_m)
-                 for each in found]
+        found = [replace(device, credible_radius_m=widening * device.credible_radius_m)
+                 for device in found]
     count = dict(zip(links.device_names, np.bincount(links.device)))
     lost = [f"{name} ({links_of})" for name, links_of in count.items()
-            if links_of and name not in {each.device for each in found}]
+            if links_of and name not in {device.device for device in found}]
     if lost:
         notes.append(f"not located, for want of links (at least {MIN_LINKS} are needed): "
                      f"{listed(lost)}")
-    table = pd.DataFrame({"device": [each.device for each in found],
-                          "x_m": [each.x_m for each in found], "y_m": [each.y_m for each in found],
-                          "radius_m": [each.credible_radius_m for each in found],
-                          "links": [count[each.device] for each in found]})
-    table = table.round(1)
+    table = pd.DataFrame([(device.device, device.x_m, device.y_m, device.credible_radius_m,
+                           count[device.device]) for device in found],
+                         columns=["device", "x_m", "y_m", "radius_m", "links"]).round(1)
     if measurements.origin is not None:
         east_deg, north_deg = to_geographic(measurements.origin, table["x_m"], table["y_m"])
         table = table.assign(latitude_deg=north_deg.round(7), longitude_deg=east_deg.round(7))
@@ -129,7 +114,7 @@ def locate_devices(measurements: Measurements | pd.DataFrame | Path | str, twin:
 
 
 def _with_receivers_of(links: Links, names: Sequence[str]) -> Links:
-    """Return the same links, counting receivers by `names`, which hold all of theirs."""
+    """Renumber the receivers of links by their place in `names`, which must include all of them."""
     place = {name: i for i, name in reversed(list(enumerate(names)))}
     number = np.array([place[name] for name in links.receiver_names])
     tracks = {(int(number[receiver]), flight): track
@@ -139,12 +124,10 @@ def _with_receivers_of(links: Links, names: Sequence[str]) -> Links:
 
 
 def _by_channel(twin: Twin, links: Links) -> FittedModel:
-    """Return a channel with the errors that it states, as it was fitted, for devices anywhere.
+    """Return the twin's channel, or its law, as a fitted model without effects.
 
-    Args:
-        twin: of `radiotwin fit`, or one that follows paths, whose law is returned.
-        links: to be located by; the channel's errors are those of the twin's devices at their
-            receivers.
+    Its error scales are the channel's median standard deviations for the twin's devices at the
+    receivers of the links.
     """
     channel = twin.channel.quick if twin.channel.follows_paths else twin.channel.trend
     known = np.isfinite(twin.device_m).all(axis=1)
@@ -153,8 +136,8 @@ def _by_channel(twin: Twin, links: Links) -> FittedModel:
     probes = link_geometry(twin.device_m, links.receiver_m[rows], device, links.city,
                            links.frequency_hz)
     sd_db, group = channel.predict(probes)[1], channel.error_group(probes)
-    usual_db = [np.median(sd_db[group == each] if (group == each).any() else sd_db)
-                for each in range(channel.error_groups(probes))]
+    usual_db = [np.median(sd_db[group == number] if (group == number).any() else sd_db)
+                for number in range(channel.error_groups(probes))]
     scale_db = np.array(usual_db) / sd_of_scale(CHANNEL_DOF)
     levels = np.zeros(channel.level_columns(probes)[0].shape[1])
     return FittedModel(channel, (), (), levels, scale_db, CHANNEL_DOF,
@@ -162,25 +145,25 @@ def _by_channel(twin: Twin, links: Links) -> FittedModel:
 
 
 def _widening(model: FittedModel, links: Links, found: list[TwinDevice]) -> float:
-    """Return how much larger residuals are than they were at home; 1 where they are much alike."""
+    """Return residuals of located devices over those in training; 1 below MIN_WIDENING."""
     if np.isnan(model.typical_misfit) or not found:
         return 1.0
     row = {name: row for row, name in enumerate(links.device_names)}
-    misfits = [misfit(model, links.select(links.device == row[each.device]), each)
-               for each in found]
+    misfits = [misfit(model, links.select(links.device == row[device.device]), device)
+               for device in found]
     ratio = float(np.sqrt(np.nanmedian(misfits) / model.typical_misfit))
     return ratio if ratio > MIN_WIDENING else 1.0
 
 
 def read_truth(path: Path, origin: Origin | None) -> pd.DataFrame:
-    """Read true positions of devices.
+    """Read true positions of devices from a table of sites.
 
     Args:
         path: a table of sites, see `radiotwin.links.site_table`.
-        origin: of the frame that devices are located in; None: not known.
+        origin: origin of the local frame; None: unknown.
 
     Returns:
-        `device, x_m, y_m`; NaN where a position is not known.
+        `device, x_m, y_m`; NaN if a position is unknown.
 
     Warns:
         A column is not used.
@@ -198,11 +181,11 @@ def read_truth(path: Path, origin: Origin | None) -> pd.DataFrame:
 
 
 def position_errors(positions: pd.DataFrame, truth: pd.DataFrame) -> dict[str, float]:
-    """Return how far located devices are from their true positions.
+    """Compare located with true positions.
 
     Args:
-        positions: as of `locate_devices`.
-        truth: `device, x_m, y_m`.
+        positions: result of `locate_devices`.
+        truth: true positions, `device, x_m, y_m`.
 
     Returns:
         number of devices, median and 90 % quantile of the distance [m], and the share of devices

@@ -1,4 +1,4 @@
-"""Places that a twin is asked about, as a user writes them: numbers, arrays, a data frame."""
+"""Read the places at which a twin should predict: numbers, arrays, or a data frame of a user."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ WANTED = "latitude, longitude or x_m, y_m, and height_m or above_ground_m"
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """Receivers and the devices that they are to hear, n links.
+    """Receiver positions and devices of n links to predict.
 
     Attributes:
-        index: (n,) labels of the rows that the user gave.
-        receiver_m: (n, 3) [m].
-        device: (n,) index of each link's device.
+        index: (n,) labels of the user's rows.
+        receiver_m: (n, 3) positions of the receivers [m].
+        device: (n,) row of each link's device.
     """
 
     index: pd.Index
@@ -35,18 +35,18 @@ class Places:
     @classmethod
     def read(cls, given: Any, columns: Mapping[str, Any], devices: list[str],
              origin: Origin | None, city: CityMap | None) -> Places:
-        """Read places.
+        """Convert a user's places to receiver positions and device rows.
 
         Args:
             given: a data frame, an array (n, 3) of x, y, z [m], or None.
-            columns: numbers, names or arrays (n,), which the data frame has or which are added.
-            devices: names of all devices; each of them is asked about where no column says which.
-            origin: of the local frame; None where it is not known.
+            columns: numbers, names or arrays (n,), added to the data frame as columns.
+            devices: names of all devices; without a column `device`, each is paired with each
+                place.
+            origin: origin of the local frame; None: unknown.
             city: the 3D map; None: the ground is at z = 0.
 
         Raises:
-            BadInput: says what is missing, or names row and column of the first value that cannot
-                be used.
+            BadInput: a column is missing, or a value is wrong (with its row and column).
         """
         frame = _frame(given, columns)
         sites = receivers_of_frame(frame)
@@ -61,8 +61,8 @@ class Places:
             "the height is missing; give height_m (above the scene's datum) or above_ground_m, "
             "such as above_ground_m=1.5 for a phone in the hand"))
         if "device" not in frame:
-            each = np.repeat(np.arange(len(frame)), len(devices))
-            return cls(frame.index[each], receiver_m[each],
+            row = np.repeat(np.arange(len(frame)), len(devices))
+            return cls(frame.index[row], receiver_m[row],
                        np.tile(np.arange(len(devices)), len(frame)))
         device = pd.Index(devices).get_indexer(frame["device"].astype(str))
         if (device < 0).any():
@@ -72,6 +72,7 @@ class Places:
 
 
 def _frame(given: Any, columns: Mapping[str, Any]) -> pd.DataFrame:
+    """Combine a data frame or array with named columns to one data frame."""
     if isinstance(given, np.ndarray) and given.ndim == 2 and given.shape[1] == 3:
         given = pd.DataFrame(given, columns=["x_m", "y_m", "z_m"])
     if given is not None and not isinstance(given, pd.DataFrame):
@@ -84,11 +85,12 @@ def _frame(given: Any, columns: Mapping[str, Any]) -> pd.DataFrame:
     try:
         if given is not None:
             return given.assign(**columns)
-        arrays = np.broadcast_arrays(*(np.asarray(each, dtype=object) for each in columns.values()))
+        arrays = np.broadcast_arrays(*(np.asarray(values, dtype=object)
+                                       for values in columns.values()))
         frame = pd.DataFrame({name: array.ravel() for name, array in zip(columns, arrays)})
         return frame.infer_objects()
     except ValueError:
-        lengths = {name: np.shape(each) for name, each in columns.items() if np.shape(each)}
+        lengths = {name: np.shape(values) for name, values in columns.items() if np.shape(values)}
         rows = "" if given is None else f" of a data frame of {len(given)} rows"
         raise BadInput(f"columns{rows} have different lengths: {lengths}; give one value for all, "
-                       "or as many of each") from None
+                       "or the same number for each") from None

@@ -1,4 +1,4 @@
-"""Gains from the devices of a twin or of a radio map to any points, and their export to ns-3."""
+"""Channel gains from devices of a twin or radio map to any points, and their export to ns-3."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,14 +17,14 @@ from radiotwin.twin import Twin
 
 def export_ns3(source: Twin | RadioMap, scene: Scene, points_m: np.ndarray, folder: Path | str, *,
                devices: Sequence[str] | None = None) -> int:
-    """Write the losses between devices and points for ns-3, see `write_ns3`.
+    """Write the path losses between devices and points for ns-3, see `write_ns3`.
 
     Args:
-        source: twin, or radio map whose lattice has the points.
-        scene: that it was made for.
+        source: twin, or radio map with the points on its lattice.
+        scene: scene of the twin or map.
         points_m: (n, 3) positions of the other ends [m].
-        folder: to write to; other files in it are kept.
-        devices: names; None: all that have a position.
+        folder: output folder; other files in it stay.
+        devices: names of devices; None: all that have a position.
 
     Returns:
         number of pairs.
@@ -53,16 +53,16 @@ def gains_at(source: Twin | RadioMap, scene: Scene, points_m: np.ndarray,
     """Return channel gains from devices to points.
 
     Args:
-        source: twin, which gives the mean also below sensitivity, or radio map.
-        scene: that it was made for.
-        points_m: (n, 3) [m]; of a map on its lattice.
-        devices: k names of those with a position.
+        source: twin, which predicts the mean even below sensitivity, or radio map.
+        scene: scene of the twin or map.
+        points_m: (n, 3) positions [m]; for a map, on its lattice.
+        devices: names of k devices that have a position.
 
     Returns:
-        (k, n) gain [dB]; NaN inside buildings, and where a map has none.
+        (k, n) gain [dB]; NaN inside buildings, and in gaps of a map.
 
     Raises:
-        BadInput: points off the lattice of a map, or a source that is not of this scene's place.
+        BadInput: points off the lattice of a map, or twin or map in another frame than the scene.
     """
     points_m = np.asarray(points_m, dtype=float).reshape(-1, 3)
     inside = scene.city.inside(points_m)
@@ -75,7 +75,7 @@ def gains_at(source: Twin | RadioMap, scene: Scene, points_m: np.ndarray,
     else:
         source.require_map(scene)
         source.warn_of_another_scene(scene, scene.content_hash())
-        row_of = {each.device: row for row, each in enumerate(source.devices)}
+        row_of = {device.device: row for row, device in enumerate(source.devices)}
         index = np.repeat([row_of[name] for name in devices], len(points_m))
         links = source.links(np.tile(points_m, (len(devices), 1)), index, scene)
         level_db = source.predict(links).mean_db - source.power_dbm(scene)[index]
@@ -86,8 +86,8 @@ def gains_at(source: Twin | RadioMap, scene: Scene, points_m: np.ndarray,
 def _placed(source: Twin | RadioMap, scene: Scene) -> pd.DataFrame:
     """Return device, x_m, y_m, z_m of the devices that have a position."""
     if isinstance(source, Twin):
-        rows = [(each.device, each.x_m, each.y_m, each.z_m) for each in source.devices]
+        rows = [(device.device, *device.position_m) for device in source.devices]
     else:
-        rows = [(each.device, each.x_m, each.y_m, each.z_m) for each in scene.config.devices
-                if each.device in set(source.devices)]
+        rows = [(device.device, device.x_m, device.y_m, device.z_m)
+                for device in scene.config.devices if device.device in set(source.devices)]
     return pd.DataFrame(rows, columns=["device", "x_m", "y_m", "z_m"]).dropna(ignore_index=True)

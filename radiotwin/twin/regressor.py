@@ -1,4 +1,4 @@
-"""A twin as an estimator of scikit-learn: for anybody's cross-validation and pipelines."""
+"""TwinRegressor: a twin as a scikit-learn estimator, for cross-validation and pipelines."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from radiotwin.twin.selection import AUTO
 
 
 class TwinRegressor:
-    """Regression of levels on positions and devices by a twin; scikit-learn is not needed.
+    """Predict levels of links from positions and devices by a twin; works without scikit-learn.
 
-    Rows of X are links, with columns as of `Measurements(frame)`: a `device` and a position of the
-    receiver. The target is their level.
+    Rows of X are links, with the columns of `Measurements(frame)`: a `device` and a position of the
+    receiver. The target is the level.
 
     Args:
-        scene: or its folder.
-        devices: data frame of the devices, as of `Measurements`; None: from columns of X.
-        model: as of `fit_twin`.
-        level: what the target is: `rssi_dbm` or `gain_db`.
-        origin: of x and y in X, see `Measurements`.
-        seed: as of `fit_twin`.
+        scene: the scene, or its folder.
+        devices: data frame of the devices, see `Measurements`; None: from columns of X.
+        model: name of the channel model, see `fit_twin`.
+        level: quantity of the target: `rssi_dbm` or `gain_db`.
+        origin: origin of x and y in X, see `Measurements`.
+        seed: see `fit_twin`.
 
     Attributes:
-        twin_: after `fit`.
+        twin_: the fitted twin.
     """
 
     _estimator_type = "regressor"
@@ -57,7 +57,7 @@ class TwinRegressor:
             y: (n,) levels [dB or dBm], NaN = not detected; None: the column `level` of X.
 
         Raises:
-            BadInput: as of `Measurements` and `fit_twin`.
+            BadInput: see `Measurements` and `fit_twin`.
         """
         if self.scene is None:
             raise BadInput("a twin needs a 3D map: TwinRegressor(scene=...), a scene or its folder")
@@ -74,7 +74,7 @@ class TwinRegressor:
         """Return the mean level (n,) of links [dB or dBm].
 
         Raises:
-            BadInput: as of `Twin.predict`, or it was not fitted.
+            BadInput: see `Twin.predict`, or not fitted yet.
         """
         if not hasattr(self, "twin_"):
             raise BadInput("this TwinRegressor is not fitted; call fit(X, y) first")
@@ -84,7 +84,7 @@ class TwinRegressor:
         return self.twin_.predict(frame)["mean_db"].to_numpy()
 
     def score(self, X: pd.DataFrame, y: ArrayLike) -> float:  # noqa: N803
-        """Return the coefficient of determination R² of the levels that were detected."""
+        """Return the coefficient of determination R² of the detected levels y (n,) of links X."""
         level_db, predicted_db = np.asarray(y, dtype=float), self.predict(X)
         known = np.isfinite(level_db) & np.isfinite(predicted_db)
         error_db, spread_db = (level_db - predicted_db)[known], np.std(level_db[known])
@@ -95,10 +95,10 @@ class TwinRegressor:
         return {name: getattr(self, name) for name in inspect.signature(type(self)).parameters}
 
     def set_params(self, **params: Any) -> Self:
-        """Set arguments of the constructor.
+        """Set arguments of the constructor by name.
 
         Raises:
-            BadInput: an unknown one.
+            BadInput: unknown name.
         """
         for name, value in params.items():
             if name not in self.get_params():
@@ -118,6 +118,7 @@ class TwinRegressor:
 
 
 def _require_frame(X: Any) -> pd.DataFrame:  # noqa: N803
+    """Return X; raise BadInput if it is no data frame."""
     if not isinstance(X, pd.DataFrame):
         raise BadInput(f"links are rows of a data frame with a device and a position, not "
                        f"{type(X).__name__}")
@@ -125,4 +126,5 @@ def _require_frame(X: Any) -> pd.DataFrame:  # noqa: N803
 
 
 def _without_levels(frame: pd.DataFrame) -> pd.DataFrame:
+    """Drop the columns of levels."""
     return frame.drop(columns=LEVELS, errors="ignore")

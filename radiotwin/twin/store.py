@@ -1,6 +1,6 @@
-"""Twins as folders: `twin.json`, and the channel in a file of its own.
+"""File format of twins: `twin.json` (typed and bounded), and `channel.safetensors`.
 
-The content of `twin.json` is typed and bounded; the bounds are far beyond what is measured.
+Bounds of numbers are far wider than any measurement.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ if TYPE_CHECKING:
     from radiotwin.twin.twin import Twin
 
 SCHEMA = "radiotwin.twin/2"
-PATTERN = "pattern"  # begins the names of arrays of antennas' patterns, with their number
+PATTERN = "pattern"  # prefix of arrays of antenna patterns, followed by the pattern's number
 CHANNEL_FILE = "channel.safetensors"
 _Decibels = Annotated[float, Field(ge=-MAX_DB, le=MAX_DB)]
 _SdDb = Annotated[float, Field(ge=1e-9, le=MAX_SD_DB)]
 _Scalar = str | int | float | bool | None
 _Json = _Scalar | list[_Scalar] | dict[str, _Scalar] | list[dict[str, _Scalar]]
 TWIN_FILE = "twin.json"
-TWIN_FILES = {TWIN_FILE, CHANNEL_FILE, "report.html"}  # the last is what `radiotwin report` makes
+TWIN_FILES = {TWIN_FILE, CHANNEL_FILE, "report.html"}  # the last is made by `radiotwin report`
 
 
 class _Strict(BaseModel):
@@ -57,7 +57,7 @@ class _Strict(BaseModel):
 
 
 class FittedEffectRecord(_Strict):
-    """A fitted effect; `params` are checked by its own `Params`, `levels` None: as always."""
+    """A fitted effect; its class checks `params`; `levels` None: the class's default."""
 
     name: str
     variant: str
@@ -67,7 +67,7 @@ class FittedEffectRecord(_Strict):
 
 
 class UnheardRecord(_Strict):
-    """Mean and uncertainty of devices without a reading."""
+    """Content of `Unheard`: offsets to expect of devices without a reading."""
 
     devices: Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]
     mean_db: _Decibels
@@ -75,7 +75,7 @@ class UnheardRecord(_Strict):
 
 
 class FittedRecord(_Strict):
-    """Levels, effects and errors fitted upon the channel."""
+    """Content of `FittedModel` without its channel."""
 
     level_coefficients: Annotated[list[_Decibels], Field(min_length=2, max_length=4)]
     scale_db: Annotated[list[_SdDb], Field(min_length=1, max_length=2)]
@@ -100,7 +100,7 @@ class FittedRecord(_Strict):
 
 
 class AntennaRecord(_Strict):
-    """Antenna of a device, or of the receivers; its pattern is beside the channel."""
+    """Antenna of a device or receiver; `pattern` numbers the arrays in the channel's file."""
 
     pattern: Annotated[int, Field(ge=0)]
     azimuth_deg: Annotated[float, Field(ge=-MAX_ANGLE_DEG, le=MAX_ANGLE_DEG)]
@@ -117,7 +117,7 @@ class RadioRecord(_Strict):
 
 
 class DeclaredRecord(_Strict):
-    """Declared radio of each device, and the frequency that the channel computes at."""
+    """Declared radio of each device, and the carrier frequency of the channel."""
 
     radios: list[RadioRecord]
     receiver_antenna: AntennaRecord | None = None
@@ -125,7 +125,7 @@ class DeclaredRecord(_Strict):
 
 
 class ChannelRecord(_Strict):
-    """Where the channel is, and what it is."""
+    """Name of the channel model, and its file."""
 
     model: str
     file: Literal["channel.safetensors"]
@@ -161,7 +161,7 @@ class _HeldOutError(_Strict):
 
 
 class _Provenance(BaseModel):
-    """Fields of the provenance that are read; the others are only kept."""
+    """Fields of the provenance that are read; others are stored without checks."""
 
     model_config = ConfigDict(strict=True)
 
@@ -202,7 +202,7 @@ class TwinRecord(_Strict):
 
 
 def encode_twin(twin: Twin) -> tuple[str, bytes]:
-    """Return the contents of a twin's two files: the record, and the channel."""
+    """Encode a twin as the contents of its two files, `twin.json` and the channel."""
     fitted = twin.fitted
     declared, patterns = _declared_record(twin.declared)
     beside = patterns | (fitted.blend.state()[0] if fitted.blend else {})
@@ -217,10 +217,15 @@ def encode_twin(twin: Twin) -> tuple[str, bytes]:
 
 
 def decode_twin(record: str, channel: bytes, source: object) -> dict[str, Any]:
-    """Return the attributes of `Twin` by name, from what `encode_twin` described.
+    """Decode the files of `encode_twin` to the attributes of `Twin` by name.
+
+    Args:
+        record: content of `twin.json`.
+        channel: content of the channel's file.
+        source: path of the twin, for messages.
 
     Raises:
-        BadInput: they are damaged, or have effects that are not installed.
+        BadInput: damaged, or an effect is not installed.
     """
     given = parse_json(record, source)
     try:
@@ -245,16 +250,12 @@ def decode_twin(record: str, channel: bytes, source: object) -> dict[str, Any]:
 
 
 def check_twin_target(folder: Path) -> None:
-    """Check that a twin can be written there without loss of anything but a twin and its page.
-
-    Raises:
-        BadInput: it cannot.
-    """
+    """Raise BadInput unless the folder is new, or holds only a twin and its page."""
     require_folder(folder, TWIN_FILES, mark=TWIN_FILE)
 
 
 def _declared_record(declared: Declared) -> tuple[dict[str, Any] | None, dict[str, np.ndarray]]:
-    """Return the record of what is declared, None of nothing, and its patterns as arrays."""
+    """Return the record of declared radios (None without any), and arrays of antenna patterns."""
     if not declared.radios:
         return None, {}
     patterns: dict[int, Pattern] = {}
@@ -272,12 +273,12 @@ def _declared_record(declared: Declared) -> tuple[dict[str, Any] | None, dict[st
     known_hz = None if np.isnan(declared.frequency_hz) else declared.frequency_hz
     return {"radios": radios, "receiver_antenna": record(declared.receiver_antenna),
             "frequency_hz": known_hz}, {
-        f"{PATTERN}{number}/{each.name}": getattr(pattern, each.name)
-        for number, pattern in enumerate(patterns.values()) for each in fields(pattern)}
+        f"{PATTERN}{number}/{field.name}": getattr(pattern, field.name)
+        for number, pattern in enumerate(patterns.values()) for field in fields(pattern)}
 
 
 def _declared(content: TwinRecord, arrays: dict[str, np.ndarray]) -> Declared:
-    """Return what a record declares, with the patterns of its arrays."""
+    """Restore declared radios from a record and the arrays of antenna patterns."""
     record = content.declared
     if record is None:
         if arrays:
@@ -286,23 +287,23 @@ def _declared(content: TwinRecord, arrays: dict[str, np.ndarray]) -> Declared:
     if len(record.radios) != len(content.devices):
         raise ValueError(f"{len(record.radios)} radios are declared of {len(content.devices)} "
                          "devices")
-    patterns, names = [], [each.name for each in fields(Pattern)]
+    patterns, names = [], [field.name for field in fields(Pattern)]
     count = len(arrays) // len(names)
     require_names("patterns", arrays, [f"{PATTERN}{number}/{name}" for number in range(count)
                                        for name in names])
     for number in range(count):
-        own = {name.removeprefix(f"{PATTERN}{number}/"): array for name, array in arrays.items()}
-        azimuth_deg = require_array(own, "azimuth_deg", (None,), 0, 360)
-        elevation_deg = require_array(own, "elevation_deg", (None,), -90, 90)
+        parts = {name.removeprefix(f"{PATTERN}{number}/"): array for name, array in arrays.items()}
+        azimuth_deg = require_array(parts, "azimuth_deg", (None,), 0, 360)
+        elevation_deg = require_array(parts, "elevation_deg", (None,), -90, 90)
         if len(elevation_deg) < 2 or not len(azimuth_deg) \
                 or not all((np.diff(axis) > 0).all() for axis in (azimuth_deg, elevation_deg)):
             raise ValueError("angles of a pattern are not in order")
         patterns.append(Pattern(azimuth_deg, elevation_deg, require_array(
-            own, "gain_dbi", (len(elevation_deg), len(azimuth_deg)), -MAX_DB, MAX_GAIN_DBI)))
+            parts, "gain_dbi", (len(elevation_deg), len(azimuth_deg)), -MAX_DB, MAX_GAIN_DBI)))
 
-    def antenna(of_end: AntennaRecord | None) -> Antenna | None:
-        return None if of_end is None else Antenna(patterns[of_end.pattern], of_end.azimuth_deg,
-                                                   of_end.tilt_deg)
+    def antenna(stored: AntennaRecord | None) -> Antenna | None:
+        return None if stored is None else Antenna(patterns[stored.pattern], stored.azimuth_deg,
+                                                   stored.tilt_deg)
 
     radios = tuple(Radio(radio.tx_power_dbm, radio.cable_loss_db, antenna(radio.antenna),
                          radio.frequency_hz) for radio in record.radios)
@@ -311,8 +312,9 @@ def _declared(content: TwinRecord, arrays: dict[str, np.ndarray]) -> Declared:
 
 
 def _fitted_record(fitted: FittedModel) -> dict[str, Any]:
-    effects = [each.record() | {"coefficients": coefficients.tolist()}
-               for each, coefficients in zip(fitted.effects, fitted.coefficients, strict=True)]
+    """Return the content of `FittedRecord`."""
+    effects = [effect.record() | {"coefficients": coefficients.tolist()}
+               for effect, coefficients in zip(fitted.effects, fitted.coefficients, strict=True)]
     return {"level_coefficients": fitted.level_coefficients.tolist(),
             "scale_db": fitted.scale_db.tolist(), "dof": float(fitted.dof), "effects": effects,
             "receivers": list(fitted.receivers),
@@ -328,17 +330,18 @@ def _fitted_record(fitted: FittedModel) -> dict[str, Any]:
 
 def _fitted(record: FittedRecord, channel: ChannelModel, devices: list[TwinDevice],
             beside: dict[str, np.ndarray]) -> FittedModel:
+    """Restore a fitted model from its record, its channel, and arrays beside the channel."""
     _check_levels(record, channel)
-    device_m = np.array([(each.x_m, each.y_m, each.z_m) for each in devices])
+    device_m = np.array([device.position_m for device in devices])
     known = {"device": len(devices), "receiver": len(record.receivers)}
     effects, coefficients = [], []
-    for each in record.effects:
-        effect = effect_named(each.name, each.variant)
-        # As JSON, because strict checks allow only there what JSON has no other form for.
-        params = effect.Params.model_validate_json(json.dumps(each.params), strict=True,
+    for stored in record.effects:
+        effect = effect_named(stored.name, stored.variant)
+        # As JSON: strict validation then still accepts lists for tuples.
+        params = effect.Params.model_validate_json(json.dumps(stored.params), strict=True,
                                                    context=known)
-        effects.append(effect.with_params(params, each.levels))
-        coefficients.append(np.array(each.coefficients, dtype=float))
+        effects.append(effect.with_params(params, stored.levels))
+        coefficients.append(np.array(stored.coefficients, dtype=float))
     shadowing = None
     if record.shadowing is not None:
         shadowing = CorrelatedShadowing.from_state(record.shadowing)
@@ -347,11 +350,10 @@ def _fitted(record: FittedRecord, channel: ChannelModel, devices: list[TwinDevic
         raise ValueError("arrays beside the channel belong to nothing")
     if record.blend is not None:
         blend = Blend.from_state(beside, record.blend, len(devices))
-    _check_terms(effects, coefficients, [each.device for each in devices], record.receivers)
+    _check_terms(effects, coefficients, [device.device for device in devices], record.receivers)
     return FittedModel(channel, tuple(effects), tuple(coefficients),
                        np.array(record.level_coefficients), np.array(record.scale_db), record.dof,
-                       np.nan_to_num(device_m),
-                       tuple(record.receivers),
+                       np.nan_to_num(device_m), tuple(record.receivers),
                        np.nan if record.first_s is None else record.first_s,
                        record.device_sd_db, record.likelihood_power, shadowing,
                        record.radius_factor,
@@ -360,6 +362,7 @@ def _fitted(record: FittedRecord, channel: ChannelModel, devices: list[TwinDevic
 
 
 def _unheard(record: UnheardRecord | None, devices: int) -> Unheard | None:
+    """Restore `Unheard`, after checking its devices."""
     if record is None:
         return None
     if max(record.devices) >= devices:
@@ -369,7 +372,7 @@ def _unheard(record: UnheardRecord | None, devices: int) -> Unheard | None:
 
 def _check_terms(effects: list[Effect], coefficients: list[np.ndarray], devices: list[str],
                  receivers: list[str]) -> None:
-    """Refuse effects with another number of coefficients than they need, on a link or two."""
+    """Raise ValueError if an effect has a wrong number of coefficients, tried on a few links."""
     n = max(len(devices), len(receivers), 2)
     row, nothing = np.arange(n), np.zeros(n)
     columns = Columns(
@@ -382,19 +385,19 @@ def _check_terms(effects: list[Effect], coefficients: list[np.ndarray], devices:
         ends=Ends(device_names=devices, receiver_names=receivers or ["any"],
                   flight_names=["f0", "f1"], device_m=np.zeros((len(devices), 3)),
                   anchors=frozenset(range(len(devices))), flown=Flown.of(columns)))
-    for each, own in zip(effects, coefficients, strict=True):
-        if each.needs_map or each.is_exact:
+    for effect, stored in zip(effects, coefficients, strict=True):
+        if effect.needs_map or effect.is_exact:
             continue  # checked when it predicts
-        term = each.term(links, lambda links, exact=False: np.zeros(len(links)))
-        if term.columns.shape[1] != len(own):
-            raise ValueError(f"{each.name} needs {term.columns.shape[1]} coefficients and "
-                             f"has {len(own)}")
+        term = effect.term(links, lambda links, exact=False: np.zeros(len(links)))
+        if term.columns.shape[1] != len(stored):
+            raise ValueError(f"{effect.name} needs {term.columns.shape[1]} coefficients and "
+                             f"has {len(stored)}")
         if not (np.isfinite(term.offset_db).all() and np.isfinite(term.columns).all()):
-            raise ValueError(f"{each.name} adds something else than numbers")
+            raise ValueError(f"{effect.name} adds levels that are not finite")
 
 
 def _check_levels(record: FittedRecord, channel: ChannelModel) -> None:
-    """Refuse another number of levels or of scales than the channel has classes of links."""
+    """Raise ValueError unless levels and error scales fit the channel's classes of links."""
     if not isinstance(channel, BUILT_IN):
         return
     allowed = {(2, 1), (4, 2)} if channel.uses_map else {(2, 1)}

@@ -1,4 +1,4 @@
-"""The twin: a channel, the positions of all devices, and effects and errors fitted upon them."""
+"""Twin: fitted channel and effects, and positions of all devices; predicts levels and maps."""
 
 from __future__ import annotations
 
@@ -62,62 +62,63 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 MAX_NAMES = 40  # more names would hide the map
-_TURN = np.linspace(0.0, 2 * np.pi, 73)
-CHUNK, CHUNK_WITH_EFFECTS = 200_000, 20_000  # links predicted at once: bounds memory
+_TURN = np.linspace(0.0, 2 * np.pi, 73)  # angles of a drawn circle [rad]
+CHUNK, CHUNK_WITH_EFFECTS = 200_000, 20_000  # links predicted at a time: bounds memory
+HEIGHTS = "receiver_heights_m"  # in the provenance: 10 and 90 % quantile, above the ground
+MAX_SAMPLED = 10_000  # links from which these are computed
+MIN_GAP_M = 10.0  # between these heights and a lattice for which the user is warned
 
 
 def plot_positions(devices: list[TwinDevice], ax: Axes | None, origin: Origin | None,
                    scene: Scene | None, geographic: bool | None) -> Axes:
-    """Draw devices with the circles of their 90 % radii; see `Twin.plot`."""
+    """Draw devices with circles of their 90 % radii; arguments as in `Twin.plot`."""
     frame, ax = PlotFrame.choose(origin, geographic), new_axes(ax)
     if scene is not None:
         draw_outlines(ax, scene, frame)
-    placed = [each for each in devices if np.isfinite([each.x_m, each.y_m]).all()]
+    placed = [device for device in devices if np.isfinite([device.x_m, device.y_m]).all()]
     for role, marker, size, colour, label in MARKS:
         for sure in (True, False):
-            some = [each for each in placed if each.role == role and each.located == sure]
-            if not some:
+            group = [device for device in placed if device.role == role and device.located == sure]
+            if not group:
                 continue
             name = label if role == "anchor" else "located" if sure else "best guess, not located"
-            x_m, y_m = np.array([(each.x_m, each.y_m) for each in some]).T
+            x_m, y_m = np.array([(device.x_m, device.y_m) for device in group]).T
             draw_points(ax, frame, x_m, y_m, marker=marker, s=size, label=name, zorder=4,
                         facecolors=colour if sure else "white", edgecolors="black" if sure
                         else colour, linewidths=0.7 if sure else 1.5)
-    wide = [each for each in placed if each.located and 0 < each.credible_radius_m < np.inf]
-    for number, each in enumerate(wide):
-        ring = frame.at(each.x_m + each.credible_radius_m * np.cos(_TURN),
-                        each.y_m + each.credible_radius_m * np.sin(_TURN))
+    circled = [device for device in placed
+               if device.located and 0 < device.credible_radius_m < np.inf]
+    for number, device in enumerate(circled):
+        ring = frame.at(device.x_m + device.credible_radius_m * np.cos(_TURN),
+                        device.y_m + device.credible_radius_m * np.sin(_TURN))
         ax.plot(*ring, color="#f08a00", linewidth=1.2, zorder=3,
                 label="" if number else "90 % radius")
-    for each in placed[:MAX_NAMES]:
-        x, y = frame.at(each.x_m, each.y_m)
-        ax.annotate(plain(each.device, 24), (float(x), float(y)), xytext=(5, 5),
+    for device in placed[:MAX_NAMES]:
+        x, y = frame.at(device.x_m, device.y_m)
+        ax.annotate(plain(device.device, 24), (float(x), float(y)), xytext=(5, 5),
                     textcoords="offset points", fontsize=8, zorder=5)
     frame.prepare(ax)
     add_legend(ax)
     missing = len(devices) - len(placed)
     ax.set_title(f"{len(devices)} devices" + f", {missing} without a position" * bool(missing))
     return ax
-HEIGHTS = "receiver_heights_m"  # in the provenance: 10 and 90 % of the links, above the ground
-MAX_SAMPLED = 10_000  # links that tell these
-MIN_GAP_M = 10.0  # between these and a lattice: no other map, for drones and phones alike
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Twin(Summarised):
-    """A learnt model of all links of a scene.
+    """A fitted model of all radio links of a scene.
 
     Attributes:
-        fitted: the channel, and levels, effects and errors fitted upon it; the channel alone where
-            `close-loop` did not look and the channel does not need levels.
-        devices: in the order of the measurements' `devices.csv`.
-        level: `gain_db`, or `rssi_dbm` where transmit power is unknown.
-        limit_db: level below which receivers do not detect [dB]: the median of theirs, see
-            `Links.usual_limit_db`; None where it was not known.
-        provenance: measurements, scene, seed and version that made it.
-        declared: of the devices' powers, cables, antennas and carriers; what of it is in the levels
-            was taken off them before anything was learnt, and is put back where they are predicted.
-        scene: that is taken where none is given; not saved with the twin.
+        fitted: channel with refitted levels, effects and error scales; only the channel if the twin
+            is of `radiotwin fit` and the channel needs no levels.
+        devices: devices in the order of the measurements' `devices.csv`.
+        level: predicted quantity: `gain_db`, or `rssi_dbm` if transmit power is unknown.
+        limit_db: limit of detection [dB], the median over receivers, see `Links.usual_limit_db`;
+            None: unknown.
+        provenance: measurements, scene, seed and version of the fit.
+        declared: declared powers, cables, antennas and carriers of the devices; they were
+            subtracted from levels before the fit, and are added to predictions.
+        scene: default scene of predictions; not saved with the twin.
     """
 
     fitted: FittedModel
@@ -130,10 +131,10 @@ class Twin(Summarised):
 
     @property
     def params(self) -> pd.DataFrame:
-        """Fitted law: `links` (LoS, NLoS or all), `parameter, value, low, high, unit`.
+        """Return the fitted log-distance law: `links, parameter, value, low, high, unit`.
 
-        The interval holds 90 %; it is empty where it is not known, such as after `close-loop`.
-        There is no row where the channel has no log-distance law.
+        `links` is LoS, NLoS or all. `low` to `high` is the 90 % interval, NaN if unknown, such as
+        after `close-loop`. Empty if the channel has no log-distance law.
         """
         rows = self.provenance.get(LAW)
         if rows is None:
@@ -143,65 +144,66 @@ class Twin(Summarised):
 
     @property
     def positions(self) -> pd.DataFrame:
-        """Where the devices are: `device, role, located, radius_m`, and their place.
+        """Return the positions of the devices: `device, role, located, radius_m, x_m, y_m, z_m`.
 
-        `radius_m` holds 90 % of the probability. The place is `x_m, y_m, z_m`; with an origin also
-        `latitude_deg, longitude_deg`.
+        `radius_m` holds 90 % of the probability. With a known origin also `latitude_deg,
+        longitude_deg`.
         """
-        rows = [(each.device, each.role, each.located, each.credible_radius_m)
-                for each in self.devices]
+        rows = [(device.device, device.role, device.located, device.credible_radius_m)
+                for device in self.devices]
         table = pd.DataFrame(rows, columns=["device", "role", "located", "radius_m"])
         return with_coordinates(table, self.device_m, self.origin)
 
     @property
     def channel(self) -> ChannelModel:
-        """As it was fitted first, without levels that are fitted again."""
+        """Return the channel model, before levels are refitted with effects."""
         return self.fitted.channel
 
     @property
     def device_m(self) -> np.ndarray:
-        """(k, 3) positions [m]; NaN where nothing is known of a device's."""
-        return np.array([each.position_m for each in self.devices], dtype=float).reshape(-1, 3)
+        """Return the positions (k, 3) of the devices [m]; NaN: unknown."""
+        return np.array([device.position_m for device in self.devices],
+                        dtype=float).reshape(-1, 3)
 
     @property
     def effects(self) -> tuple[Effect, ...]:
-        """Effects that `close-loop` found."""
+        """Return the effects that `close-loop` found."""
         return self.fitted.effects
 
     @property
     def has_gains(self) -> bool:
-        """Whether its levels are gains, or powers of devices that declare their transmit power."""
+        """Return True if levels are gains, or all devices declare their transmit power."""
         return self.level == "gain_db" or self.declared.knows_powers
 
     @property
     def is_corrected(self) -> bool:
-        """Whether effects or interpolated shadowing were added to it."""
+        """Return True if `close-loop` added effects or interpolated shadowing."""
         return bool(self.effects) or self.fitted.shadowing is not None
 
     @property
     def residual_field(self) -> ResidualField | None:
-        """Interpolation of the residual; None where the twin has none."""
+        """Return the interpolation of residuals; None if the twin does not interpolate."""
         if isinstance(self.channel, RegressionKriging | PathKriging):
             return self.channel.field
         return None if self.fitted.shadowing is None else self.fitted.shadowing.field
 
     @property
     def origin(self) -> Origin | None:
-        """Of the frame of its positions; None where it is not known."""
+        """Return the origin of the local frame; None: unknown."""
         known = self.provenance.get("origin")
         return None if known is None else Origin.model_validate(known)
 
     @property
     def description(self) -> str:
-        """Channel and effects, in one line."""
-        names = [each.name for each in self.effects]
+        """Return the names of channel and effects in one line."""
+        names = [effect.name for effect in self.effects]
         if self.fitted.shadowing is not None:
             names.append(SHADOWING)
         return self.channel.name + (f" with {', '.join(names)}" if names else "")
 
     def links(self, receiver_m: np.ndarray, device: np.ndarray, scene: Scene | None = None
               ) -> Links:
-        """Return links that nobody measured: receiver, flight and time unset.
+        """Make links to predict, without receiver names, flights and times.
 
         Args:
             receiver_m: (n, 3) positions of the receivers [m].
@@ -209,7 +211,7 @@ class Twin(Summarised):
             scene: the 3D map and the radio; None: the twin's own, if it has one.
 
         Raises:
-            BadInput: they are no such arrays.
+            BadInput: wrong shapes, or unknown rows of devices.
         """
         receiver_m, device = np.asarray(receiver_m), np.asarray(device)
         if receiver_m.ndim != 2 or receiver_m.shape[1] != 3 or device.shape != receiver_m.shape[:1]:
@@ -220,10 +222,10 @@ class Twin(Summarised):
             raise BadInput(f"the devices of links are rows of twin.devices, 0 to {len(self) - 1}; "
                            "twin.predict takes their names")
         scene = scene or self.scene
-        anchors = frozenset(i for i, each in enumerate(self.devices) if each.role == "anchor")
+        anchors = frozenset(i for i, known in enumerate(self.devices) if known.role == "anchor")
         return Links(
             columns=Columns.unmeasured(receiver_m, device, self.limit_db),
-            ends=Ends(device_names=[each.device for each in self.devices],
+            ends=Ends(device_names=[known.device for known in self.devices],
                       device_m=np.nan_to_num(self.device_m), anchors=anchors,
                       declared=self.declared),
             world=World(frequency_hz=np.nan if scene is None else scene.config.radio.frequency_hz,
@@ -241,26 +243,26 @@ class Twin(Summarised):
     def predict(self, places: Links | Measurements | pd.DataFrame | np.ndarray | None = None, *,
                 scene: Scene | Path | str | None = None, interval: float = 0.9,
                 **columns: Any) -> Prediction | pd.DataFrame:
-        """Return the levels that are expected at places, or of links.
+        """Predict levels at places, or of links.
 
         Args:
-            places: a data frame with the columns below, or an array (n, 3) of x, y, z [m]; or
-                measurements, whose receivers are taken for faultless. Or `Links` with the twin's
-                devices; measured ones with the twin's receivers.
-            scene: the 3D map; None: the one that the twin was fitted in or loaded with.
-            interval: probability that a level is between `low_db` and `high_db`, where the device
-                is where the twin has it.
+            places: a data frame with the columns below, an array (n, 3) of x, y, z [m], or
+                measurements, without the effects of their receivers; or `Links` with the twin's
+                devices and receivers.
+            scene: the 3D map; None: the scene in which the twin was fitted or loaded.
+            interval: probability that a level is between `low_db` and `high_db`, given the device's
+                position.
             columns: numbers or arrays: `latitude, longitude` [degrees] or `x_m, y_m`; `height_m`
-                above the scene's datum, or `above_ground_m`; and `device`, a name. Without names,
-                every device at each place.
+                above the scene's datum, or `above_ground_m`; and `device`, a name. Without device,
+                every device is predicted at each place.
 
         Returns:
-            of places a data frame, in the order and with the index of theirs: `device, x_m, y_m,
-            z_m`, `mean_db`, `sd_db`, `low_db`, `high_db` [dB or dBm], `detection_probability`; NaN
-            of a device that the twin has nowhere. Of links a `Prediction`.
+            for places a data frame with their order and index: `device, x_m, y_m, z_m`,
+            `mean_db`, `sd_db`, `low_db`, `high_db` [dB or dBm], `detection_probability`; NaN for a
+            device without a position. For links a `Prediction`.
 
         Raises:
-            BadInput: what cannot be used, and what to pass.
+            BadInput: a wrong argument; the message says what to pass.
         """
         if isinstance(places, Links):
             return self._predict(places)
@@ -272,7 +274,7 @@ class Twin(Summarised):
         if isinstance(places, Measurements):
             places = in_known_frame(places, self.origin, "the twin").table
         origin = self.origin or (None if world is None else world.origin)
-        names = [each.device for each in self.devices]
+        names = [device.device for device in self.devices]
         found = Places.read(places, columns, names, origin, None if world is None else world.city)
         known = np.isfinite(self.device_m).all(axis=1)[found.device]
         values = np.full((3, len(known)), np.nan)
@@ -292,27 +294,29 @@ class Twin(Summarised):
             "detection_probability": detected}, index=found.index)
 
     def _world(self, scene: Scene | Path | str | None) -> Scene | None:
+        """Return the given scene, or by default the twin's own."""
         return self.scene if scene is None else Scene.of(scene)
 
     def _predict(self, links: Links) -> Prediction:
+        """Predict links in chunks, to bound memory."""
         size = CHUNK if self.fitted.is_channel_alone else CHUNK_WITH_EFFECTS
         chunks = [links] if len(links) <= size else [
             links.select(slice(start, start + size)) for start in range(0, len(links), size)]
         return Prediction.concatenate([self.fitted.predict(chunk) for chunk in chunks])
 
     def radio_map(self, scene: Scene | Path | str | None = None) -> RadioMap:
-        """Return mean and standard deviation of the level over a scene's lattice.
+        """Predict mean and standard deviation of gains over a scene's lattice as a radio map.
 
-        For all devices that have a position, at faultless receivers. The mean is given below
-        sensitivity, too; attribute `gain_limit_db` says where detection ends, by the readings where
-        these have shown it.
+        All devices that have a position, without effects of receivers. The mean is predicted even
+        below sensitivity; the attribute `gain_limit_db` is the limit of detection, estimated from
+        the readings if possible.
 
         Args:
-            scene: None: the one that the twin was fitted in or loaded with.
+            scene: the scene; None: that in which the twin was fitted or loaded.
 
         Raises:
-            BadInput: the twin was fitted without a 3D map or in another frame, or predicts what no
-                link has.
+            BadInput: the twin was fitted without a 3D map or in another frame, or predicts
+                impossible levels.
         """
         world = self._world(scene)
         if world is None:
@@ -321,7 +325,7 @@ class Twin(Summarised):
         return RadioMap.collect(self.map_stream(world))
 
     def map_stream(self, scene: Scene) -> MapStream:
-        """Return the map of `radio_map`, made block by block when it is written.
+        """Return the map of `radio_map` as a stream, predicted block by block when it is written.
 
         Raises:
             BadInput: the twin was fitted without a 3D map, or in another frame.
@@ -359,7 +363,7 @@ class Twin(Summarised):
                          make).with_origin(scene.config.origin)
 
     def save(self, folder: Path | str) -> None:
-        """Write the twin's folder, whole or not at all; a twin that is in it is replaced.
+        """Write the twin's folder, all or nothing; replace a twin in it.
 
         Raises:
             BadInput: the folder exists and is not a twin's.
@@ -376,11 +380,11 @@ class Twin(Summarised):
         """Read a twin's folder.
 
         Args:
-            folder: as `save` writes it.
-            scene: that its predictions need, if it was learnt in one.
+            folder: folder written by `save`.
+            scene: scene for predictions, or its folder; None: none.
 
         Raises:
-            BadInput: not a twin's folder, a damaged one, or effects that are not installed.
+            BadInput: not a twin's folder, damaged, or an effect is not installed.
         """
         folder = Path(folder)
         path = folder / TWIN_FILE
@@ -394,32 +398,33 @@ class Twin(Summarised):
 
     def plot(self, ax: Axes | None = None, *, scene: Scene | Path | str | None = None,
              geographic: bool | None = None) -> Axes:
-        """Draw where the devices are; circles hold 90 % of the probability.
+        """Draw the positions of the devices; circles hold 90 % of the probability.
 
         Args:
-            ax: axes of matplotlib to draw into; None: a new figure.
-            scene: whose buildings are outlined; None: none are.
-            geographic: whether axes are longitude and latitude; None: where the origin is known.
+            ax: matplotlib axes; None: a new figure.
+            scene: scene whose buildings are outlined; None: no buildings.
+            geographic: axes in longitude and latitude; None: if the origin is known.
 
         Returns:
             The axes.
 
         Raises:
-            BadInput: longitude and latitude are wanted and the origin is not known.
+            BadInput: longitude and latitude are requested, and the origin is unknown.
         """
         world = None if scene is None else Scene.of(scene)
         origin = self.origin if world is None else self.origin or world.origin
         return plot_positions(self.devices, ax, origin, world, geographic)
 
     def to_geodataframe(self) -> GeoDataFrame:
-        """Return a row for each device, with a point in metres of the local frame.
+        """Return a row for each device, with a point in the local frame [m].
 
-        Columns are those of `TwinDevice`; a device that could not be located has no geometry.
+        Columns are those of `TwinDevice`; a device without a position has no geometry.
 
         Raises:
             BadInput: GeoPandas is not installed.
         """
-        table = pd.DataFrame([asdict(each) for each in self.devices]).drop(columns="second_mode")
+        table = pd.DataFrame([asdict(device) for device in self.devices])
+        table = table.drop(columns="second_mode")
         return geo_data_frame(table, self.origin, position_m=self.device_m)
 
     def __len__(self) -> int:
@@ -428,44 +433,43 @@ class Twin(Summarised):
 
     @property
     def _summary(self) -> Summary:
-        unknown = [each for each in self.devices if each.role == "unknown"]
-        located = sum(each.located for each in unknown)
+        unknown = [device for device in self.devices if device.role == "unknown"]
+        located = sum(device.located for device in unknown)
         limit = "not known" if self.limit_db is None else (
             f"{self.limit_db:g} {'dB' if self.level == 'gain_db' else 'dBm'}")
         found = f"{located} of {len(unknown)} unknown ones located"
         return Summary("Twin", f"{self.description}, {count(len(self), 'device')}, {found}, "
                        f"{self.level}", (
             ("channel", self.channel.name),
-            ("effects", some(each.name for each in self.effects) or "none"),
-            ("devices", some(each.device for each in self.devices)), ("unknown devices", found),
+            ("effects", some(effect.name for effect in self.effects) or "none"),
+            ("devices", some(device.device for device in self.devices)), ("unknown devices", found),
             ("level", self.level), ("declared of devices", self.declared.description),
             ("limit of detection", limit),
             ("scene", str(self.provenance.get("scene", "none")))))
 
     def encode(self) -> tuple[str, bytes]:
-        """Return the contents of the twin's two files: the record, and the channel."""
+        """Encode the twin as the contents of its two files, `twin.json` and the channel."""
         return encode_twin(self)
 
     @classmethod
     def decode(cls, record: str, channel: bytes, source: object) -> Twin:
-        """Return the twin that `encode` described.
+        """Decode a twin from the contents of its files.
 
         Args:
             record: content of `twin.json`.
             channel: content of the channel's file.
-            source: where they are from, for the message.
+            source: path of the twin, for messages.
 
         Raises:
-            BadInput: as `load`.
+            BadInput: see `load`.
         """
         return cls(**decode_twin(record, channel, source))
 
     def power_dbm(self, scene: Scene) -> np.ndarray:
-        """Return the transmit power that is in the levels of each device (k,) [dBm]; 0 of gains.
+        """Return the transmit power (k,) contained in the devices' levels [dBm]; 0 for gains.
 
         Warns:
-            Levels are received powers, no device declares its power, and the scene has the default
-            of 0 dBm.
+            Levels are received powers, and neither devices nor the scene declare transmit power.
         """
         if self.level == "gain_db":
             return np.zeros(len(self))
@@ -480,14 +484,14 @@ class Twin(Summarised):
         return np.full(len(self), radio.tx_power_dbm)
 
     def warn_of_another_scene(self, scene: Scene, scene_hash: str) -> None:
-        """Warn where the twin was learnt in another scene than one with this hash."""
+        """Warn if the twin was fitted in another scene than the one with this hash."""
         if self.provenance.get("scene_hash") not in (None, scene_hash):
             warnings.warn(f"the twin was learnt in another scene ({self.provenance.get('scene')}) "
                           f"than {scene.folder}, or this one has changed since: geometry, radio or "
                           "declared devices differ", stacklevel=3)
 
     def warn_of_other_heights(self, scene: Scene) -> None:
-        """Warn where the lattice of a scene is far above or below what the twin was learnt from."""
+        """Warn if a scene's lattice is far above or below the heights of the measurements."""
         low_m, high_m = self.provenance.get(HEIGHTS) or (-np.inf, np.inf)
         first_m, *_, last_m = np.repeat(np.sort(scene.config.lattice.altitudes_m), 2)
         gap_m = max(first_m - high_m, low_m - last_m)
@@ -498,33 +502,26 @@ class Twin(Summarised):
                           f"--altitudes {(low_m + high_m) / 2:g}", stacklevel=3)
 
     def require_frame(self, scene: Scene) -> None:
-        """Check that the positions of the twin are not known to be in another frame than a scene's.
-
-        Raises:
-            BadInput: they are.
-        """
-        own, other = self.origin, scene.config.origin
-        if own is not None and other is not None and not is_same_frame(own, other):
-            raise BadInput(f"the twin is in the frame about {origin_text(own)}, the scene "
+        """Raise BadInput if twin and scene have known origins that differ."""
+        known, other = self.origin, scene.config.origin
+        if known is not None and other is not None and not is_same_frame(known, other):
+            raise BadInput(f"the twin is in the frame about {origin_text(known)}, the scene "
                            f"{scene.folder} in that about {origin_text(other)}: positions would be "
-                           "elsewhere; build the "
-                           f"scene with --origin {own.latitude_deg:.10g},{own.longitude_deg:.10g}"
-                           f",{own.altitude_m:g}, or fit again with this one")
+                           f"elsewhere; build the scene with --origin {known.latitude_deg:.10g},"
+                           f"{known.longitude_deg:.10g},{known.altitude_m:g}, or fit again with "
+                           "this one")
 
     def require_map(self, scene: Scene | None) -> None:
-        """Check that the twin was fitted with a 3D map in this frame, or without one as now.
+        """Raise BadInput unless the twin was fitted with a map, as given, or without, as now.
 
-        Levels that were fitted to each class of line of sight need a map, and one level for all
-        links cannot use one.
-
-        Raises:
-            BadInput: it was not.
+        Levels fitted to LoS and NLoS need a map; one level for all links cannot use it. Twin and
+        scene must also have the same frame.
         """
         if scene is not None:
             self.require_frame(scene)
         if not self.channel.uses_map:
             return
-        # A level and a slope for each class; without any, `radiotwin fit` made it with a map.
+        # With a map there are levels for LoS and NLoS; `radiotwin fit` always has a map.
         with_map = (self.channel.follows_paths or self.fitted.is_channel_alone
                     or len(self.fitted.level_coefficients) > 2)
         if with_map and scene is None:
@@ -538,9 +535,9 @@ class Twin(Summarised):
 
 
 def measured_heights(links: Links) -> dict[str, list[float]]:
-    """Return the entry of the provenance on how high receivers were; none without a map."""
+    """Return the provenance entry on receivers' heights above ground; empty without a map."""
     if links.city is None:
         return {}
-    some_m = links.receiver_m[::max(len(links) // MAX_SAMPLED, 1)]
-    above_m = some_m[:, 2] - links.city.ground_height_m(*some_m[:, :2].T)
+    sampled_m = links.receiver_m[::max(len(links) // MAX_SAMPLED, 1)]
+    above_m = sampled_m[:, 2] - links.city.ground_height_m(*sampled_m[:, :2].T)
     return {HEIGHTS: np.quantile(above_m, (0.1, 0.9)).round(1).tolist()}

@@ -228,15 +228,15 @@ def test_noise_that_was_asked_for_reaches_the_receivers(small_scene, monkeypatch
 
 
 def test_errors_of_a_twin_last_as_long_as_its_residuals_say(small_scene):
-    """Of a truth whose errors belong to places; without measurements they are drawn anew in every slot."""
+    """Of a truth whose errors belong to places; or else they are drawn anew in every slot."""
     truth = segmented_truth(small_scene)
     x_m, y_m = np.meshgrid(truth.lattice.x_m, truth.lattice.y_m)
     waves_db = 5 * np.sin(2 * np.pi * x_m / 160) * np.sin(2 * np.pi * y_m / 160)
     waved = truth.dataset.drop_vars("sigma_db").assign(gain_db=truth.dataset["gain_db"] + waves_db)
     flown = fly_survey(small_scene, replace(truth, dataset=waved), flights=3, noise_db=0.5)
     twin = fit_twin(flown, small_scene, model="segmented_log_distance")
-    run, known = run_settings(), Known.of(twin.devices)
-    lasting, brief = (twin_mission(small_scene, run, twin, known, each) for each in (flown, None))
+    lasting, brief = (twin_mission(small_scene, run_settings(twin_shadowing=errors), twin, Known.of(twin.devices))
+                      for errors in ("fitted", "slot"))
     assert lasting.shadowing_share > 0.3 and brief.shadowing_share == 0
 
 

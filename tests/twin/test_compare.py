@@ -36,7 +36,7 @@ def tables(small_scene, truth, flown):
     """`tables(executor)` compares three models: what is written, as text."""
     def compared(executor=None):
         found = compare_models(*split_flights(flown, 1), small_scene, truth, seed=0, executor=executor,
-                               models=("log_distance", "segmented_nn", "kriging"))
+                               models=("log_distance", "segmented_log_distance", "kriging"))
         return found.scores.to_csv(), found.locations.to_csv(), found.predictions.to_csv()
     return compared
 
@@ -163,7 +163,6 @@ def test_devices_of_unknown_position_are_in_neither_class(small_scene, flown):
 
 
 def test_a_killed_comparison_goes_on_with_the_models_that_were_fitted(tables, whole, monkeypatch):
-    from radiotwin.propagation.laws.segmented_nn import SegmentedNN
     from radiotwin.runtime import pieces
     from radiotwin.twin.localize import on_map
 
@@ -174,7 +173,6 @@ def test_a_killed_comparison_goes_on_with_the_models_that_were_fitted(tables, wh
         killed.setattr("radiotwin.propagation.laws.kriging.RegressionKriging.fit", kill)
         tables()
     assert store.saved >= 4
-    monkeypatch.setattr(SegmentedNN, "fit", lambda *_: pytest.fail("fitted again"))
     with pieces.keep_pieces() as store:
         assert tables() == whole
     assert store.earlier >= 4  # two channels, and the devices located with each

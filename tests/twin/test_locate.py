@@ -110,12 +110,10 @@ def test_a_twin_of_fit_locates_a_device_that_it_has_not_seen(run, tmp_path, smal
     assert np.hypot(located["x_m"][0] - true_m[0], located["y_m"][0] - true_m[1]) < 20.0
 
 
-def test_what_lacks_its_map_does_not_locate():
-    law, paths = (Twin(FittedModel.of_channel(channel), [], "gain_db", None) for channel in (SegmentedLogDistance(), ImagePaths()))
+@pytest.mark.parametrize("channel", [SegmentedLogDistance(), ImagePaths()], ids=["law", "paths"])
+def test_what_lacks_its_map_does_not_locate(channel):
     with pytest.raises(BadInput, match="made with a 3D map"):
-        module.check_can_locate(law, None)
-    with pytest.raises(BadInput, match="made with a 3D map"):
-        module.check_can_locate(paths, None)
+        Twin(FittedModel.of_channel(channel), [], "gain_db", None).require_map(None)
 
 
 ORIGIN = Origin(latitude_deg=48.0, longitude_deg=11.0, altitude_m=0.0)

@@ -54,7 +54,7 @@ def _sd_db(residual_db: np.ndarray) -> float:
 def _calibration(loop: Loop, scene: Scene | None) -> RadiusCalibration:
     """Calibrate the credible radii of located devices on anchors that folds hold out."""
     model, links = loop.for_twin, loop.links
-    if model.whole.channel.follows_paths:  # such a twin locates nothing: `check_can_locate`
+    if model.whole.channel.follows_paths:  # `locate` does not use it
         return RadiusCalibration()
     models = [fold.learnt.for_positions() for fold in model.folds]
     # Anchors that the loop found elsewhere are not at their declared position.

@@ -257,12 +257,6 @@ class UrbanMicro(_Urban3gpp):
 
 def _los_probability(flat_m: np.ndarray, sure_m: np.ndarray | float,
                      length_m: np.ndarray | float) -> np.ndarray:
-    """Return the LoS probability (n,) in the form of TR 38.901, Table 7.4.2-1.
-
-    Args:
-        flat_m: (n,) horizontal distance [m].
-        sure_m: distance up to which it is 1 [m].
-        length_m: decay length beyond [m].
-    """
+    """Return the LoS probability (n,), 1 up to `sure_m`, then falling (TR 38.901, 7.4.2)."""
     share = np.minimum(np.divide(sure_m, np.maximum(flat_m, 1e-9)), 1.0)
     return share + np.exp(-flat_m / length_m) * (1 - share)

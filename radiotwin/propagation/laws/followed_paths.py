@@ -241,12 +241,7 @@ def followed_from_m(geometry: LinkGeometry, row: int) -> _Position:
 
 def _follow(city: CityMap, wanted: list[tuple[_Position, np.ndarray]],
             frequency_hz: float) -> list[tuple[_Followed, np.ndarray]]:
-    """Return the paths from positions to their receivers, from the cache or newly traced.
-
-    Args:
-        city: the map.
-        wanted: positions, each with its receivers (n, 3) [m].
-        frequency_hz: of the radio [Hz].
+    """Return the paths from positions to their receivers (n, 3) [m], cached or newly traced.
 
     Returns:
         for each position its cached paths, and the row (n,) of each receiver in them.
@@ -430,16 +425,7 @@ class KnownPaths:
 @njit(cache=True, nogil=True, error_model="numpy")
 def _blocked(points_m: np.ndarray, count: np.ndarray, centre_m: tuple[float, float],
              half_m: tuple[float, float], turn_rad: float, top_m: float) -> np.ndarray:
-    """Return (p,) bool: a leg of the path goes through a box, see `UprightBox`.
-
-    Args:
-        points_m: (p, k, 3) points of each path [m].
-        count: (p,) number of points of each path.
-        centre_m: see `UprightBox`.
-        half_m: see `UprightBox`.
-        turn_rad: see `UprightBox`.
-        top_m: see `UprightBox`.
-    """
+    """Return (p,) bool: a leg between the points of a path passes through an `UprightBox`."""
     out = np.zeros(len(count), dtype=np.bool_)
     cosine, sine = np.cos(turn_rad), np.sin(turn_rad)
     reach_m = np.hypot(half_m[0], half_m[1])
@@ -469,13 +455,7 @@ def _clip_leg(start_m: float, step_m: float, low_m: float, high_m: float, enter:
               leave: float) -> tuple[float, float]:
     """Clip the interval (enter, leave) of a leg's parameter 0..1 to the slab between two planes.
 
-    Args:
-        start_m: coordinate across the slab where the leg begins [m].
-        step_m: coordinate where it ends, minus `start_m` [m].
-        low_m: coordinate of the first plane [m].
-        high_m: coordinate of the second plane [m].
-        enter: start of the interval so far.
-        leave: its end; enter > leave: empty.
+    `start_m` and `start_m + step_m` are the leg's ends across the slab; enter > leave: empty.
     """
     if abs(step_m) < MIN_STEP_M:
         return (enter, leave) if low_m <= start_m <= high_m else (1.0, 0.0)

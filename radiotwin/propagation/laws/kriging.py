@@ -269,12 +269,7 @@ class ResidualField:
         return covariance
 
     def _fit_correlation(self, fields: list[_Field], kinds: bool) -> None:
-        """Maximise the marginal likelihood of the points (Rasmussen and Williams 2006, eq. 5.8).
-
-        Args:
-            fields: points of each series.
-            kinds: fit b, too, since there is more than one kind.
-        """
+        """Maximise the marginal likelihood of the points (Rasmussen and Williams 2006, eq. 5.8)."""
         distances_m = [cdist(field.position_m, field.position_m) for field in fields]
         max_m = max(float(distance_m.max()) for distance_m in distances_m)
         if max_m == 0.0:

@@ -77,13 +77,7 @@ def _estimate_sizes(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
                     diffuse: tuple[float, float], offsets_db: Offsets, seed: int) -> _Sizes:
     """Estimate the standard deviations of walls and heights by maximum likelihood.
 
-    Args:
-        links: n links over the map, to devices whose positions are known.
-        level_db: (n,) measured levels [dB]; NaN: not detected.
-        limit_db: limit of detection [dB].
-        diffuse: diffuse power, see `ImagePaths`.
-        offsets_db: offsets of reflected and diffracted paths [dB].
-        seed: of the random maps.
+    `diffuse` and `offsets_db` are those of `paths_db`; `seed` is of the random maps.
     """
     power, fit = (diffuse, offsets_db), LinkFit(level_db, limit_db)
     base_db = paths_db(links, *power)
@@ -127,14 +121,9 @@ def _estimate_sizes(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
 def _mean_square_db(links: LinkGeometry, base_db: np.ndarray,
                     power: tuple[tuple[float, float], Offsets], size_m: tuple[float, float],
                     seed: int) -> np.ndarray:
-    """Return the mean square change (n,) [dB²] of levels over maps with random errors.
+    """Return the mean square change (n,) [dB²] of levels over random maps, from `base_db` (n,).
 
-    Args:
-        links: n links.
-        base_db: (n,) levels over the given map [dB].
-        power: diffuse power and offsets, see `paths_db`.
-        size_m: standard deviations of walls and of heights [m].
-        seed: of the random maps.
+    `size_m` are the standard deviations of walls and heights, `power` the arguments of `paths_db`.
     """
     city = links.city
     if city is None or not any(size_m):
@@ -149,13 +138,7 @@ def _mean_square_db(links: LinkGeometry, base_db: np.ndarray,
 
 
 def _size(best: np.intp, likely: np.ndarray, scale_m: tuple[float, ...]) -> Size:
-    """Convert steps on a scale of sizes to estimate and interval [m].
-
-    Args:
-        best: step of greatest likelihood.
-        likely: steps in the 90 % region; the interval ends one step beyond.
-        scale_m: the traced sizes [m].
-    """
+    """Convert best and `likely` steps on a scale of sizes to estimate and 90 % interval [m]."""
     steps = np.array([best, likely[0] - 1, likely[-1] + 1]) / STEPS
     size_m, low_m, high_m = np.interp(steps, np.arange(len(scale_m)), scale_m).tolist()
     return size_m, low_m, high_m

@@ -76,9 +76,8 @@ class Ways(NamedTuple):
     source_m: np.ndarray
 
 
-def _open_ways(
-    city: CityMap, surfaces: Surfaces, before: np.ndarray, edge: np.ndarray, device_m: np.ndarray
-) -> Ways:
+def _open_ways(city: CityMap, surfaces: Surfaces, before: np.ndarray, edge: np.ndarray,
+               device_m: np.ndarray) -> Ways:
     """Return the ways, of w, by which the device (3,) [m] sees a sampled point of the edge."""
     lit_m, source_m, samples = _lit_parts(surfaces, before, edge, device_m)
     points = PathBuffer.allocate(SAMPLE_CHUNK + int(samples.max(initial=0)))
@@ -96,9 +95,8 @@ def _open_ways(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _lit_parts(
-    surfaces: Surfaces, before: np.ndarray, edge: np.ndarray, device_m: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _lit_parts(surfaces: Surfaces, before: np.ndarray, edge: np.ndarray, device_m: np.ndarray
+               ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return `lit_m` and `source_m` of `Ways`, and the number of points (w,) to sample."""
     image = np.empty((MAX_INTERACTIONS + 1, 3))
     lit_m, source_m = np.zeros((len(edge), 2)), np.zeros((len(edge), 2))
@@ -122,11 +120,9 @@ def _lit_parts(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _sample(
-    surfaces: Surfaces, before: np.ndarray, edge: np.ndarray, device_m: np.ndarray,
-    lit_m: np.ndarray, samples: np.ndarray, is_seen: np.ndarray, first: int, way: int,
-    points: PathBuffer,
-) -> tuple[int, int]:
+def _sample(surfaces: Surfaces, before: np.ndarray, edge: np.ndarray, device_m: np.ndarray,
+            lit_m: np.ndarray, samples: np.ndarray, is_seen: np.ndarray, first: int, way: int,
+            points: PathBuffer) -> tuple[int, int]:
     """Fill a buffer with paths to points on lit parts of edges, just off the edge.
 
     Begins at row `way`, and skips ways that are already known to be open. Points are every
@@ -170,10 +166,9 @@ def _sample(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _with_facets_after(
-    surfaces: Surfaces, ways: Ways, first: np.ndarray, end: np.ndarray, after: np.ndarray,
-    parent: np.ndarray, depth: int,
-) -> tuple[np.ndarray, np.ndarray]:
+def _with_facets_after(surfaces: Surfaces, ways: Ways, first: np.ndarray, end: np.ndarray,
+                       after: np.ndarray, parent: np.ndarray, depth: int
+                       ) -> tuple[np.ndarray, np.ndarray]:
     """Combine each way to an edge with the sequences of facets after it that rays can reach.
 
     Args:
@@ -265,9 +260,8 @@ def _sphere(count: int) -> np.ndarray:
     return vectors
 
 
-def _edge_sequences(
-    city: CityMap, facets: CityFacets, rows: np.ndarray, depth: int
-) -> FacetSequences:
+def _edge_sequences(city: CityMap, facets: CityFacets, rows: np.ndarray, depth: int
+                    ) -> FacetSequences:
     """Find the sequences of up to `depth` facets that rays from edges (n,) visit.
 
     EDGE_RAYS rays start from each 20 m of an edge, for at most 200 m, spread along it.
@@ -288,10 +282,8 @@ def _edge_sequences(
     return _shoot(city, facets, start_m, direction[ray], of_edge, len(rows), depth, False)
 
 
-def _shoot(
-    city: CityMap, facets: CityFacets, start_m: np.ndarray, direction: np.ndarray,
-    source: np.ndarray, sources: int, depth: int, beyond: bool = True,
-) -> FacetSequences:
+def _shoot(city: CityMap, facets: CityFacets, start_m: np.ndarray, direction: np.ndarray,
+           source: np.ndarray, sources: int, depth: int, beyond: bool = True) -> FacetSequences:
     """Trace rays through up to `depth` reflections, and record the facets that they visit.
 
     Args:
@@ -340,9 +332,8 @@ def _shoot(
                           np.concatenate(seen or [np.empty((0, 2), dtype=int)]))
 
 
-def _first_facets(
-    city: CityMap, facets: CityFacets, start_m: np.ndarray, direction: np.ndarray
-) -> np.ndarray:
+def _first_facets(city: CityMap, facets: CityFacets, start_m: np.ndarray, direction: np.ndarray
+                  ) -> np.ndarray:
     """Return (2, n) distance [m] and index of the first facet on rays; -1: none, or its back."""
     distance_m, face, cosine = city.first_hits_towards(start_m, direction)
     facet = np.where(face >= 0, facets.of_face[face], -1)
@@ -467,15 +458,9 @@ class CandidateSearch:
         out[:, :2] = found[:, :self._depth]
         return out
 
-    def _to_edges(
-        self, sequences: FacetSequences, facing: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return facets (n, depth) and edge (n,) of the ways to the edges of all facets hit.
-
-        Args:
-            sequences: facets that rays from the device visit.
-            facing: (f,) facets that face the device.
-        """
+    def _to_edges(self, sequences: FacetSequences, facing: np.ndarray
+                  ) -> tuple[np.ndarray, np.ndarray]:
+        """Return facets (n, depth) and edge (n,) of the ways to the edges of all facets hit."""
         direct = np.column_stack([np.zeros(len(facing), dtype=int), facing])
         reflected = sequences.next_facets[sequences.next_facets[:, 0] > 0]
         pairs = np.concatenate([direct, reflected])

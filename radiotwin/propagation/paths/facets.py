@@ -139,16 +139,11 @@ def _split(vertices_m: np.ndarray, sides: np.ndarray) -> tuple[np.ndarray, np.nd
     return np.column_stack([corners[:-1], corners[1:]])[same_side], sides[:-1][same_side]
 
 
-def _rows_of_sides(
-    pieces: np.ndarray, side_of_piece: np.ndarray, side_of_row: np.ndarray, side_count: int
-) -> tuple[np.ndarray, np.ndarray]:
+def _rows_of_sides(pieces: np.ndarray, side_of_piece: np.ndarray, side_of_row: np.ndarray,
+                   side_count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return corners (s, 2) and triangle (s,) of the pieces of all triangles' sides.
 
-    Args:
-        pieces: (p, 2) corners of the pieces of distinct sides.
-        side_of_piece: (p,) distinct side of each piece.
-        side_of_row: (3 t,) distinct side of each side of each triangle.
-        side_count: number of distinct sides.
+    `pieces` (p, 2) are of distinct sides, `side_of_row` (3 t,) is the distinct side of each side.
     """
     count = np.bincount(side_of_piece, minlength=side_count)
     first = np.cumsum(count) - count
@@ -348,14 +343,9 @@ def _join(ends_m: np.ndarray, pair: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 @njit(cache=True)
 def _joined(ends_m: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Join pieces (p, 2, 3) [m] that touch or overlap within groups of collinear pieces.
+    """Join pieces (p, 2, 3) [m] that touch within groups of collinear ones, which begin at `first`.
 
-    Args:
-        ends_m: pieces, group after group.
-        first: first piece of each group, and the number of pieces.
-
-    Returns:
-        (e, 2, 3) ends of the joined pieces [m], and (e,) a piece of each one's group.
+    Returns ends (e, 2, 3) [m] of the joined pieces, and a piece (e,) of each one's group.
     """
     out_m, row = np.empty_like(ends_m), np.empty(len(ends_m), dtype=np.int64)
     count = 0
@@ -389,10 +379,9 @@ def _wedges(topology: Topology, min_rad: float, max_rad: float) -> np.ndarray:
 
 
 @njit(cache=True)
-def _open_sectors(
-    vertices_m: np.ndarray, triangles: np.ndarray, normal: np.ndarray, segments: np.ndarray,
-    owner: np.ndarray, group: np.ndarray, min_rad: float, max_rad: float,
-) -> np.ndarray:
+def _open_sectors(vertices_m: np.ndarray, triangles: np.ndarray, normal: np.ndarray,
+                  segments: np.ndarray, owner: np.ndarray, group: np.ndarray, min_rad: float,
+                  max_rad: float) -> np.ndarray:
     """Find the open sectors of `_wedges` by sorting the triangles at each segment by angle."""
     found = []
     for g in range(len(group) - 1):

@@ -14,10 +14,8 @@ from radiotwin.runtime.compiled import njit
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def buffer_gains(
-    surfaces: Surfaces, candidates: Candidates, wave_number: float, slabs: Slabs,
-    buffer: PathBuffer, rows: np.ndarray,
-) -> np.ndarray:
+def buffer_gains(surfaces: Surfaces, candidates: Candidates, wave_number: float, slabs: Slabs,
+                 buffer: PathBuffer, rows: np.ndarray) -> np.ndarray:
     """Compute the power gains of paths in a buffer, for vertically polarised isotropic antennas.
 
     Args:
@@ -41,10 +39,8 @@ def buffer_gains(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def buffer_amplitudes(
-    surfaces: Surfaces, candidates: Candidates, wave_number: float, slabs: Slabs,
-    buffer: PathBuffer, rows: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
+def buffer_amplitudes(surfaces: Surfaces, candidates: Candidates, wave_number: float, slabs: Slabs,
+                      buffer: PathBuffer, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Compute the complex gains and lengths of paths in a buffer; arguments as in `buffer_gains`.
 
     Returns:
@@ -62,10 +58,9 @@ def buffer_amplitudes(
 
 
 @njit(cache=True, error_model="numpy")
-def _received_field(
-    surfaces: Surfaces, candidates: Candidates, wave_number: float, slabs: Slabs,
-    buffer: PathBuffer, path: int, legs: np.ndarray, field: np.ndarray,
-) -> tuple[complex, float, float]:
+def _received_field(surfaces: Surfaces, candidates: Candidates, wave_number: float, slabs: Slabs,
+                    buffer: PathBuffer, path: int, legs: np.ndarray, field: np.ndarray
+                    ) -> tuple[complex, float, float]:
     """Compute the field of one path at the receiver by reflecting and diffracting it on the way.
 
     Overwrites `legs`, directions and lengths of up to MAX_INTERACTIONS + 1 legs, and `field` (3,).

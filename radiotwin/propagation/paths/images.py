@@ -87,10 +87,8 @@ def sequence_length(facets: np.ndarray, row: int) -> int:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def find_paths(
-    surfaces: Surfaces, candidates: Candidates, device_m: np.ndarray, receiver_m: np.ndarray,
-    cursor: int, buffer: PathBuffer,
-) -> tuple[int, int]:
+def find_paths(surfaces: Surfaces, candidates: Candidates, device_m: np.ndarray,
+               receiver_m: np.ndarray, cursor: int, buffer: PathBuffer) -> tuple[int, int]:
     """Find paths for all candidates and receivers in order, until the buffer is full.
 
     Args:
@@ -194,9 +192,8 @@ def _same_facets(facets: np.ndarray, row: int, other: int) -> int:
 
 
 @njit(cache=True, error_model="numpy")
-def source_images(
-    planes: np.ndarray, facets: np.ndarray, device_m: np.ndarray, image: np.ndarray
-) -> bool:
+def source_images(planes: np.ndarray, facets: np.ndarray, device_m: np.ndarray, image: np.ndarray
+                  ) -> bool:
     """Mirror the device in facets one after another; False if an image is behind the next facet.
 
     Writes the device and its images into `image` (n + 1, 3) [m].
@@ -211,10 +208,8 @@ def source_images(
 
 
 @njit(cache=True, error_model="numpy")
-def reflections_back(
-    planes: np.ndarray, uv_m: np.ndarray, facets: np.ndarray, x: float, y: float, z: float,
-    image: np.ndarray, points_m: np.ndarray,
-) -> bool:
+def reflections_back(planes: np.ndarray, uv_m: np.ndarray, facets: np.ndarray, x: float, y: float,
+                     z: float, image: np.ndarray, points_m: np.ndarray) -> bool:
     """Find the reflection points between the device and x, y, z, the receiver or edge point [m].
 
     Writes them into `points_m[1:]`; returns False if there is no such path.
@@ -229,11 +224,10 @@ def reflections_back(
 
 
 @njit(cache=True, error_model="numpy")
-def _from_edge(
-    planes: np.ndarray, uv_m: np.ndarray, edges: np.ndarray, edge: int, facets: np.ndarray,
-    first: int, along_m: float, across_m: float, x: float, y: float, z: float, mirror: np.ndarray,
-    points_m: np.ndarray,
-) -> tuple[bool, float, float, float]:
+def _from_edge(planes: np.ndarray, uv_m: np.ndarray, edges: np.ndarray, edge: int,
+               facets: np.ndarray, first: int, along_m: float, across_m: float, x: float, y: float,
+               z: float, mirror: np.ndarray, points_m: np.ndarray
+               ) -> tuple[bool, float, float, float]:
     """Find the diffraction point on an edge and the reflection points from there to x, y, z [m].
 
     Writes them into `points_m[first:]`. `along_m` and `across_m` are the coordinates of the
@@ -267,10 +261,8 @@ def _from_edge(
 
 
 @njit(cache=True, error_model="numpy")
-def _meet(
-    planes: np.ndarray, uv_m: np.ndarray, facet: int, x: float, y: float, z: float,
-    image_x: float, image_y: float, image_z: float,
-) -> tuple[bool, float, float, float]:
+def _meet(planes: np.ndarray, uv_m: np.ndarray, facet: int, x: float, y: float, z: float,
+          image_x: float, image_y: float, image_z: float) -> tuple[bool, float, float, float]:
     """Intersect the line from a point to an image [m] with a facet; False if it misses."""
     before_m = height(planes, facet, x, y, z)
     behind_m = -height(planes, facet, image_x, image_y, image_z)
@@ -283,10 +275,8 @@ def _meet(
     return within(planes, uv_m, facet, x, y, z), x, y, z
 
 
-def found_clear(
-    city: CityMap, surfaces: Surfaces, candidates: Candidates, device_m: np.ndarray,
-    receiver_m: np.ndarray, buffer: PathBuffer,
-) -> Iterator[np.ndarray]:
+def found_clear(city: CityMap, surfaces: Surfaces, candidates: Candidates, device_m: np.ndarray,
+                receiver_m: np.ndarray, buffer: PathBuffer) -> Iterator[np.ndarray]:
     """Find the unblocked paths from a device (3,) to receivers (n, 3) [m], one buffer at a time.
 
     Yields:
@@ -317,9 +307,8 @@ def _neighbours_together(points_m: np.ndarray) -> np.ndarray:
     return order
 
 
-def clear_paths(
-    city: CityMap, surfaces: Surfaces, candidates: Candidates, buffer: PathBuffer, found: int
-) -> np.ndarray:
+def clear_paths(city: CityMap, surfaces: Surfaces, candidates: Candidates, buffer: PathBuffer,
+                found: int) -> np.ndarray:
     """Test the first `found` paths in a buffer for obstacles; return the unblocked rows (m,).
 
     Points of interaction are moved off their surface by `SKIN_M`, so that no surface blocks the
@@ -341,10 +330,8 @@ def clear_paths(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _move_off_surfaces(
-    surfaces: Surfaces, candidates: Candidates, buffer: PathBuffer, skin_m: float,
-    points_m: np.ndarray,
-) -> None:
+def _move_off_surfaces(surfaces: Surfaces, candidates: Candidates, buffer: PathBuffer,
+                       skin_m: float, points_m: np.ndarray) -> None:
     """Write the points of paths (k, paths, 3) [m], moved by `skin_m` off their surfaces."""
     planes, edges = surfaces.planes, surfaces.edges
     for path in range(points_m.shape[1]):

@@ -159,10 +159,9 @@ def _fresnel_tail(a: float) -> complex:
 
 
 @njit(cache=True)
-def wedge_coefficients(
-    phi: float, phi_in: float, sine_edge: float, distance_m: float, wave_number: float, n: float,
-    face_0: tuple[complex, complex], face_n: tuple[complex, complex],
-) -> tuple[complex, complex]:
+def wedge_coefficients(phi: float, phi_in: float, sine_edge: float, distance_m: float,
+                       wave_number: float, n: float, face_0: tuple[complex, complex],
+                       face_n: tuple[complex, complex]) -> tuple[complex, complex]:
     """Return the diffraction coefficients of a wedge [2, eq. 25-28, 3].
 
     Args:
@@ -215,9 +214,8 @@ def _cotangent_term(beta: float, x: float, n: float, sign: int) -> complex:
 
 
 @njit(cache=True, error_model="numpy")
-def reflect(
-    normal: np.ndarray, material: int, direction_in: np.ndarray, slabs: Slabs, field: np.ndarray
-) -> Triple:
+def reflect(normal: np.ndarray, material: int, direction_in: np.ndarray, slabs: Slabs,
+            field: np.ndarray) -> Triple:
     """Reflect the complex field (3,) of a ray in place, and return the reflected ray's direction.
 
     Args:
@@ -248,9 +246,8 @@ def reflect(
 
 
 @njit(cache=True, error_model="numpy")
-def around_edge(
-    edges: np.ndarray, edge: int, x: float, y: float, z: float
-) -> tuple[bool, float, float]:
+def around_edge(edges: np.ndarray, edge: int, x: float, y: float, z: float
+                ) -> tuple[bool, float, float]:
     """Return cylindrical coordinates of a point x, y, z [m] around an edge.
 
     Returns:
@@ -269,10 +266,9 @@ def around_edge(
 
 
 @njit(cache=True, error_model="numpy")
-def diffract(
-    edges: np.ndarray, edge: int, direction_in: np.ndarray, direction: np.ndarray, before_m: float,
-    after_m: float, wave_number: float, slabs: Slabs, field: np.ndarray,
-) -> None:
+def diffract(edges: np.ndarray, edge: int, direction_in: np.ndarray, direction: np.ndarray,
+             before_m: float, after_m: float, wave_number: float, slabs: Slabs, field: np.ndarray
+             ) -> None:
     """Diffract the field of a ray at an edge in place [2, eq. 9-13], without the spreading factor.
 
     Args:

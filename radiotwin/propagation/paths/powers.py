@@ -138,10 +138,9 @@ class PathPowers:
 COMPONENTS = tuple(field.name for field in fields(PathPowers))[:-2]
 
 
-def path_powers(
-    city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, frequency_hz: float, *,
-    depth: int = DEPTH, rays: int = DEVICE_RAYS, candidates: Candidates | None = None,
-) -> PathPowers:
+def path_powers(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, frequency_hz: float, *,
+                depth: int = DEPTH, rays: int = DEVICE_RAYS, candidates: Candidates | None = None
+                ) -> PathPowers:
     """Find the paths from a device to receivers and add up their powers by kind.
 
     Surfaces are slabs of the map's materials, the ground is a half space of `city.ground_material`.
@@ -214,17 +213,11 @@ def path_powers(
         PathDirections.joined(directions), len(receiver_m)), strongest)
 
 
-def _strongest_candidates(
-    candidates: Candidates, found: Sequence[tuple[np.ndarray, ...]], total: np.ndarray,
-    over_seen_edge: np.ndarray,
-) -> Candidates:
-    """Select the candidates with a path above `WEAK_SHARE` of a link, and one for each edge seen.
+def _strongest_candidates(candidates: Candidates, found: Sequence[tuple[np.ndarray, ...]],
+                          total: np.ndarray, over_seen_edge: np.ndarray) -> Candidates:
+    """Select candidates with a path above `WEAK_SHARE` of a link, and one for each edge seen.
 
-    Args:
-        candidates: c candidates that were tried.
-        found: candidate (p,), link (p,) and power (p,) of paths, in parts.
-        total: (n,) power of each link.
-        over_seen_edge: (c,) bool, the first interaction is at an edge.
+    `found` has candidate, link and power (p,) of paths; `total` (n,) is the power of each link.
     """
     candidate, link, power = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
     keep = over_seen_edge & (candidates.after[:, :1] < 0).all(axis=1)
@@ -260,10 +253,9 @@ def paths_with_points(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarra
     return PathsWithPoints(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
-def clear_paths_gains(
-    city: CityMap, search: CandidateSearch, candidates: Candidates, device_m: np.ndarray,
-    receiver_m: np.ndarray, buffer: PathBuffer, wave_number: float, slabs: Slabs,
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def clear_paths_gains(city: CityMap, search: CandidateSearch, candidates: Candidates,
+                      device_m: np.ndarray, receiver_m: np.ndarray, buffer: PathBuffer,
+                      wave_number: float, slabs: Slabs) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield rows (p,) of a buffer that hold unblocked paths, and their power gains (p,), linear."""
     for clear in found_clear(city, search.surfaces, candidates, device_m, receiver_m, buffer):
         yield clear, buffer_gains(search.surfaces, candidates, wave_number, slabs, buffer, clear)
@@ -290,9 +282,7 @@ def _strongest(paths: PathDirections, links: int) -> PathDirections:
     return PathDirections(*(array[kept] for array in paths))
 
 
-def _direct(
-    city: CityMap, from_m: np.ndarray, to_m: np.ndarray, wave_number: float
-) -> np.ndarray:
+def _direct(city: CityMap, from_m: np.ndarray, to_m: np.ndarray, wave_number: float) -> np.ndarray:
     """Return the free-space power gains (n,), linear (ITU-R P.525-4, eq. 4); 0 if blocked."""
     distance_m = np.linalg.norm(to_m - from_m, axis=1)
     gain = 1 / np.maximum(2 * wave_number * distance_m, 1e-9) ** 2

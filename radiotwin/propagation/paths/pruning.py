@@ -46,9 +46,8 @@ def spheres_around(receiver_m: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True, error_model="numpy")
-def lit_part(
-    planes: np.ndarray, edges: np.ndarray, edge: int, before: np.ndarray, image: np.ndarray
-) -> tuple[float, float]:
+def lit_part(planes: np.ndarray, edges: np.ndarray, edge: int, before: np.ndarray, image: np.ndarray
+             ) -> tuple[float, float]:
     """Return the part of an edge that the device can light by reflections at facets before it.
 
     A point at t metres along the edge is in front of a facet, and its line to the image passes
@@ -111,10 +110,8 @@ def open_window(edges: np.ndarray, edge: int, lit_m: np.ndarray, window: np.ndar
 
 
 @njit(cache=True, error_model="numpy")
-def narrow(
-    planes: np.ndarray, edges: np.ndarray, edge: int, after: np.ndarray, k: int,
-    source_m: np.ndarray, window: np.ndarray,
-) -> bool:
+def narrow(planes: np.ndarray, edges: np.ndarray, edge: int, after: np.ndarray, k: int,
+           source_m: np.ndarray, window: np.ndarray) -> bool:
     """Narrow a window of diffracted rays to those that pass through facet `after[k]`.
 
     A ray to a point at q along the edge and r from its line leaves the edge at t, where
@@ -198,9 +195,8 @@ def _coordinate(point_m: np.ndarray, origin_m: np.ndarray, axis: np.ndarray) -> 
 
 
 @njit(cache=True, error_model="numpy")
-def _positive(
-    at_start: float, at_end: float, length_m: float, low_m: float, high_m: float
-) -> tuple[float, float]:
+def _positive(at_start: float, at_end: float, length_m: float, low_m: float, high_m: float
+              ) -> tuple[float, float]:
     """Clip an interval of an edge [m] to where a function linear along the edge is positive."""
     if at_start < 0.0 and at_end < 0.0:
         return 0.0, 0.0
@@ -212,10 +208,8 @@ def _positive(
 
 
 @njit(cache=True, error_model="numpy")
-def through_facet(
-    planes: np.ndarray, facet: int, image: np.ndarray, receiver_m: np.ndarray, spheres: np.ndarray,
-    possible: np.ndarray,
-) -> int:
+def through_facet(planes: np.ndarray, facet: int, image: np.ndarray, receiver_m: np.ndarray,
+                  spheres: np.ndarray, possible: np.ndarray) -> int:
     """Find the receivers that see an image through a facet's bounding rectangle.
 
     Most candidates are rejected here, so this and `over_edge` use few scalars, which stay in
@@ -283,11 +277,9 @@ def through_facet(
 
 
 @njit(cache=True, error_model="numpy")
-def over_edge(
-    planes: np.ndarray, edges: np.ndarray, edge: int, after: np.ndarray, window: np.ndarray,
-    source_m: np.ndarray, receiver_m: np.ndarray, spheres: np.ndarray, frame: np.ndarray,
-    possible: np.ndarray,
-) -> int:
+def over_edge(planes: np.ndarray, edges: np.ndarray, edge: int, after: np.ndarray,
+              window: np.ndarray, source_m: np.ndarray, receiver_m: np.ndarray, spheres: np.ndarray,
+              frame: np.ndarray, possible: np.ndarray) -> int:
     """Find the receivers that a ray diffracted at the lit part of an edge may reach.
 
     Args:

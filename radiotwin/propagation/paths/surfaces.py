@@ -56,9 +56,8 @@ def height(planes: np.ndarray, facet: int, x: float, y: float, z: float) -> floa
 
 
 @njit(cache=True, error_model="numpy")
-def within(
-    planes: np.ndarray, triangle_uv_m: np.ndarray, facet: int, x: float, y: float, z: float
-) -> bool:
+def within(planes: np.ndarray, triangle_uv_m: np.ndarray, facet: int, x: float, y: float, z: float
+           ) -> bool:
     """Return True if a point in the plane of a facet lies on the facet."""
     if facet == len(planes) - 1:
         return True
@@ -92,9 +91,8 @@ def _side(ax: float, ay: float, bx: float, by: float, x: float, y: float) -> flo
 
 
 @njit(cache=True, error_model="numpy")
-def mirrored(
-    planes: np.ndarray, facet: int, x: float, y: float, z: float
-) -> tuple[float, float, float]:
+def mirrored(planes: np.ndarray, facet: int, x: float, y: float, z: float
+             ) -> tuple[float, float, float]:
     """Return the mirror image of a point in the plane of a facet."""
     twice = 2.0 * height(planes, facet, x, y, z)
     return (x - twice * planes[facet, NORMAL], y - twice * planes[facet, NORMAL + 1],

@@ -62,10 +62,8 @@ class EdgePairsToTry(NamedTuple):
     first: np.ndarray
 
 
-def paths_over_two_edges(
-    city: CityMap, surfaces: Surfaces, to_try: EdgePairsToTry, device_m: np.ndarray,
-    receiver_m: np.ndarray,
-) -> EdgePairs:
+def paths_over_two_edges(city: CityMap, surfaces: Surfaces, to_try: EdgePairsToTry,
+                         device_m: np.ndarray, receiver_m: np.ndarray) -> EdgePairs:
     """Find the unblocked paths from a device (3,) to receivers (n, 3) [m] over two edges."""
     tried = _possible(surfaces.edges, to_try, device_m, receiver_m)
     points_m, possible = _solve(surfaces.edges, tried, device_m, receiver_m)
@@ -81,9 +79,8 @@ def paths_over_two_edges(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _possible(
-    edges: np.ndarray, to_try: EdgePairsToTry, device_m: np.ndarray, receiver_m: np.ndarray
-) -> np.ndarray:
+def _possible(edges: np.ndarray, to_try: EdgePairsToTry, device_m: np.ndarray,
+              receiver_m: np.ndarray) -> np.ndarray:
     """Return (t, 3) receiver, first and second edge that Keller's cones do not rule out."""
     n, seen = len(receiver_m), len(to_try.edge)
     end_m = np.empty((len(edges), 2, 3))
@@ -133,9 +130,8 @@ def _cone_meets(edges: np.ndarray, edge: int, from_m: np.ndarray, end_m: np.ndar
 
 
 @njit(cache=True, error_model="numpy")
-def _solve(
-    edges: np.ndarray, tried: np.ndarray, device_m: np.ndarray, receiver_m: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _solve(edges: np.ndarray, tried: np.ndarray, device_m: np.ndarray, receiver_m: np.ndarray
+           ) -> tuple[np.ndarray, np.ndarray]:
     """Return the shortest paths (t, 4, 3) [m] over pairs of edges, and the rows that have one."""
     points_m, possible = np.empty((len(tried), 4, 3)), np.empty(len(tried), dtype=np.int64)
     count = 0
@@ -158,9 +154,8 @@ def _solve(
 
 
 @njit(cache=True, error_model="numpy")
-def shortest(
-    one: np.ndarray, other: np.ndarray, from_m: np.ndarray, to_m: np.ndarray
-) -> tuple[float, float]:
+def shortest(one: np.ndarray, other: np.ndarray, from_m: np.ndarray, to_m: np.ndarray
+             ) -> tuple[float, float]:
     """Find the shortest path between two points over the lines of two edges (Fermat's principle).
 
     The length is convex in both positions; Newton's method with halved steps finds its minimum,
@@ -217,9 +212,8 @@ def shortest(
 
 
 @njit(cache=True, error_model="numpy")
-def wave_at_edge(
-    near_m: float, between_m: float, far_m: float, sine2: float
-) -> tuple[float, float]:
+def wave_at_edge(near_m: float, between_m: float, far_m: float, sine2: float
+                 ) -> tuple[float, float]:
     """Compute the distance parameter at one of two edges, for the wave diffracted by the other.
 
     Args:
@@ -241,9 +235,8 @@ def wave_at_edge(
 
 
 @njit(cache=True, error_model="numpy")
-def two_edge_gains(
-    surfaces: Surfaces, wave_number: float, slabs: Slabs, edge: np.ndarray, points_m: np.ndarray,
-) -> np.ndarray:
+def two_edge_gains(surfaces: Surfaces, wave_number: float, slabs: Slabs, edge: np.ndarray,
+                   points_m: np.ndarray) -> np.ndarray:
     """Compute the power gains (p,), linear, of paths over two edges, see `EdgePairs`.
 
     The other arguments are those of `radiotwin.propagation.paths.fields.buffer_gains`.

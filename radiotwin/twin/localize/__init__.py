@@ -1,4 +1,4 @@
-"""Positions of unknown devices: over a 3D map, along paths over it, and without one."""
+"""Locate unknown devices: with a 3D map, along paths over the map, and without a map."""
 
 from radiotwin.twin.localize.along_paths import Relocation
 from radiotwin.twin.localize.calibration import RadiusCalibration, calibrate_radii, misfit

@@ -1,11 +1,11 @@
-"""Unknown devices where paths over the map put them, searched for around where a law does.
+"""Relocation: locate unknown devices by tracing paths, around the position of a log-distance law.
 
-A law with two classes of links takes one just behind an edge, a few decibels below line of sight,
-for one with it, and moves a device in a narrow street to where it would have line of sight. Paths
-tell the two apart, and take long. So the search goes from coarse to fine: by the law in all cells
-around, by short paths of a few links in the best of these, by all paths of more links in the best
-of those, and downhill from there. A step downhill tries only the reflections and diffractions that
-matter a few metres away. The powers along paths are kept for other parts of the same links.
+A law with LoS and NLoS takes a link just behind an edge, a few decibels weaker, for one with line
+of sight, and moves a device in a narrow street to a position with line of sight. Paths distinguish
+both, but take long. So the search goes from coarse to fine: the law in all cells around; short
+paths of a few links in the best cells; all paths of more links in the best of these; and a descent
+from there. A step of the descent tries only the reflections and diffractions that are strong a few
+metres away. Path powers are cached for other subsets of the same links.
 """
 
 from __future__ import annotations
@@ -33,35 +33,40 @@ from radiotwin.runtime.execution import Executor, Job, Resources
 from radiotwin.runtime.pieces import KeptParts, Piece, keeps, kept_with_name
 from radiotwin.runtime.processes import in_threads
 from radiotwin.scene.citymap import CityMap
-from radiotwin.twin.localize.estimate import TwinDevice
+from radiotwin.twin.localize.estimate import CREDIBLE, TwinDevice
+from radiotwin.twin.localize.on_map import distinct_modes
 from radiotwin.twin.model.model import Fit, Model
 
 _Place = tuple[float, float]  # x and y of a device [m]
 Followed = dict[tuple[float, ...], dict[int, float]]
-"""Position -> hash of the other end's position and of the antenna -> power."""
-LINKS = 150  # of a device, about
-FIT_LINKS = 1000  # that levels and error scales are fitted to
-MIN_HEARD = 30  # of these; what is not heard says little, and fits many positions
-MAX_DEVICES = 30  # of unknown position; each takes some ten seconds
-CELL_M, CELLS_APART_M = 7.0, 9.0
-MAX_CELLS = 4000  # or wider ones
-MIN_REACH_M, REACH_RADII = 70.0, 1.5  # of the search, in metres or in radii of the law's circle
-FOLLOWED_SHARE, MIN_FOLLOWED, MAX_FOLLOWED = 0.12, 16, 40  # of the cells
-DESCENTS, DESCENTS_APART_M = 2, 15.0
-STEPS_M = (4.0, 2.0, 1.0, 0.5)
-AROUND_M = (14.0, 7.0)  # rings about where a descent has ended, in case it was a local minimum
-COARSE_LINKS, COARSE_DEPTH = 50, 3  # of a first look at a position
-SECOND_LOOKS = 8  # positions that are then looked at with all links and paths
-NEAR_M = 4.0  # as far away, the same reflections and diffractions matter
-RAYS = 10_000  # from each position, 2 degrees apart: ten times as many find the same places
-MAX_MISFIT = 4.0  # square of how many times the errors of other devices
-CREDIBLE = 0.9
-WORKER_BYTES = 2 * 2**30  # of a process that searches
+"""Cache of path powers: device position -> hash of receiver position and antenna -> power."""
+LINKS = 150  # links of a device in the likelihood, about
+FIT_LINKS = 1000  # links to which levels and error scales are fitted
+MIN_HEARD = 30  # detected links needed: undetected ones fit many positions
+MAX_DEVICES = 30  # unknown devices; each takes some ten seconds
+CELL_M, CELLS_APART_M = 7.0, 9.0  # width of cells, and least distance of those that are traced
+MAX_CELLS = 4000  # cells of the search area; beyond it they are wider
+MIN_REACH_M, REACH_RADII = 70.0, 1.5  # radius of the search area [m], or in radii by the law
+FOLLOWED_SHARE, MIN_FOLLOWED, MAX_FOLLOWED = 0.12, 16, 40  # share and number of traced cells
+DESCENTS, DESCENTS_APART_M = 2, 15.0  # number, and least distance of their starts
+STEPS_M = (4.0, 2.0, 1.0, 0.5)  # of a descent
+AROUND_M = (14.0, 7.0)  # radii of rings around the end of a descent, against local minima
+COARSE_LINKS, COARSE_DEPTH = 50, 3  # links, and interactions of paths, in the coarse likelihood
+SECOND_LOOKS = 8  # positions that are then tried with all links and paths
+NEAR_M = 4.0  # within this distance the same reflections and diffractions are strong
+RAYS = 10_000  # from each position, 2 degrees apart: ten times as many find the same positions
+MAX_MISFIT = 4.0  # largest median squared residual, over that of other devices
+WORKER_BYTES = 2 * 2**30  # memory of a process that searches
 
 
 def followed_since(known: dict[tuple[float, ...], int], followed: Followed
                    ) -> dict[str, np.ndarray]:
-    """Return positions (p, 3), numbers (p,) of ends, and hashes and powers of those, new ones."""
+    """Return the new entries of a cache as arrays for a file, for `add_followed`.
+
+    Args:
+        known: number of earlier entries at each position.
+        followed: the cache.
+    """
     new = {position_m: list(powers.items())[known.get(position_m, 0):]
            for position_m, powers in followed.items() if len(powers) > known.get(position_m, 0)}
     ends = [end for powers in new.values() for end in powers]
@@ -72,10 +77,10 @@ def followed_since(known: dict[tuple[float, ...], int], followed: Followed
 
 
 def add_followed(arrays: dict[str, np.ndarray], followed: Followed) -> None:
-    """Add what `followed_since` returned."""
+    """Add the arrays of `followed_since` to a cache; raise ValueError if they are damaged."""
     ends = list(zip(arrays["hash"].tolist(), arrays["power"].tolist(), strict=True))
     if arrays["count"].sum() != len(ends):
-        raise ValueError("other counts")
+        raise ValueError("counts do not match the entries")
     last = np.cumsum(arrays["count"]).tolist()
     for position_m, end, count in zip(arrays["position_m"].tolist(), last,
                                       arrays["count"].tolist(), strict=True):
@@ -85,17 +90,17 @@ def add_followed(arrays: dict[str, np.ndarray], followed: Followed) -> None:
 
 @dataclass(eq=False)
 class Relocation:
-    """Search along paths; remembers what was followed for other parts of the same links.
+    """Search for devices along paths, with a cache of path powers for subsets of the same links.
 
     Attributes:
-        bounds: west, east, south and north end of where devices may be [m].
-        max_radius_m: of the circle by the law [m]; a device with a wider one stays.
-        thresholds: of each device: the least hash of a link's position to take part, so that all
-            parts of the links use the same ones.
-        positions: where each device was found before, which is worth trying with other links, too.
-        history: hash of all searches so far, which decide what is remembered.
-        powers: map -> position -> hash of the other end's position and the antenna -> power.
-        executor: where devices are searched for side by side, inside `keep_pieces`.
+        bounds: west, east, south and north bound of devices' positions [m].
+        max_radius_m: devices with a larger radius by the law are not searched [m].
+        thresholds: for each device the least hash of a receiver position that takes part, so that
+            all subsets of the links use the same receivers.
+        positions: earlier results for each device, tried with other links, too.
+        history: hash of all searches so far, on which the cache depends.
+        powers: cache of path powers for each map.
+        executor: runs several searches in parallel, inside `keep_pieces`.
     """
 
     bounds: tuple[float, float, float, float]
@@ -108,24 +113,24 @@ class Relocation:
 
     def relocate(self, links: Links, devices: list[TwinDevice],
                  channel: ImagePaths) -> list[TwinDevice]:
-        """Return the devices, unknown ones where paths put them.
+        """Move unknown devices to the positions of greatest likelihood along paths.
 
-        A device stays unless paths explain its links better than the law. Where more than
-        `MAX_DEVICES` are unknown, all stay.
+        A device keeps its position unless paths explain its links better than the law. If more than
+        `MAX_DEVICES` are unknown, all keep theirs.
 
         Args:
             links: n links over a map.
-            devices: located by the channel's law.
-            channel: follows paths.
+            devices: devices as located by the channel's law.
+            channel: channel that traces paths.
         """
         unknown = sum(device.role == "unknown" for device in devices)
         if unknown > MAX_DEVICES:
             return list(devices)
-        device_m = np.array([each.position_m for each in devices])
+        device_m = np.array([device.position_m for device in devices])
         placed = np.isfinite(device_m).all(axis=1)
-        few = links.select(subsample(np.flatnonzero(placed[links.device]), FIT_LINKS))
-        fits = [Model.build(few, each, DOF, device_m=device_m).fit()
-                for each in (channel.law, channel)]
+        sample = links.select(subsample(np.flatnonzero(placed[links.device]), FIT_LINKS))
+        fits = [Model.build(sample, model, DOF, device_m=device_m).fit()
+                for model in (channel.law, channel)]
         links = links.with_devices(np.where(placed[:, None], device_m, 0.0))
         searches: dict[int, _Question] = {}
         for number, device in enumerate(devices):
@@ -142,13 +147,13 @@ class Relocation:
         with progress("looking for devices along paths", total=len(searches)) as advance:
             for number, (search, device, before) in searches.items():
                 found[number] = self._search(search, device, before)
-                search.strongest.clear()  # megabytes; no other search uses them
+                search.strongest.clear()  # megabytes that no other search uses
                 before.append((found[number].x_m, found[number].y_m))
                 advance()
         return found
 
     def _search_ahead(self, searches: list[_Question]) -> None:
-        """Search on the executor's workers; `_search` finds the results among the kept parts."""
+        """Run the searches ahead of time on the executor's workers; `_search` reads the results."""
         if not self.executor.is_worth_it or not keeps() or len(searches) < 2:
             return
         inputs: list[tuple] = []
@@ -163,13 +168,13 @@ class Relocation:
         self.executor.run_ahead(job, range(len(searches)), parts)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Leave out what was followed, and where: another process follows what it needs."""
+        """Pickle without cache and executor: another process traces the paths that it needs."""
         return type(self), (self.bounds, self.max_radius_m, self.thresholds, self.positions,
                             self.history)
 
     def _search(self, search: _Search, device: TwinDevice,
                 before: list[tuple[float, float]]) -> TwinDevice:
-        """Return a device where paths put it, and remember what was followed for that."""
+        """Search one device, or load the result of an earlier run; add its paths to the cache."""
         city = search.by_law.links.city
         assert city is not None
         followed = self.powers.setdefault(city, {})
@@ -189,7 +194,7 @@ class Relocation:
         return found
 
     def _rows(self, links: Links, device: int) -> np.ndarray:
-        """Return some links of a device: the same ones in each part of them."""
+        """Choose about LINKS links of a device, the same receivers in every subset of links."""
         rows = np.flatnonzero(links.device == device)
         hashes = _hashes(links.receiver_m[rows])
         name = links.device_names[device]
@@ -200,16 +205,16 @@ class Relocation:
 
     def follow(self, links: Links, device: int, candidates: Candidates | None = None
                ) -> tuple[np.ndarray, Candidates | None]:
-        """Follow the paths of links (n,) of a device that are not known yet.
+        """Return the path power of a device's links, from the cache or newly traced.
 
         Args:
-            links: with the device where it is tried.
-            device: its row.
-            candidates: what to try; None: all that rays find.
+            links: n links with the device at the tried position.
+            device: row of the device.
+            candidates: sequences of interactions to try; None: all that rays find.
 
         Returns:
-            power (n,) through the antennas that are declared, and the candidates that matter at
-            this position if all of its paths were followed.
+            (n,) power gain through the declared antennas, linear; and the strongest candidates at
+            this position if all paths were traced, else None.
         """
         assert links.city is not None
         position_m = tuple(map(float, links.device_m[device]))
@@ -228,23 +233,23 @@ class Relocation:
         return np.array([known[key] for key in keys]), strongest
 
     def is_followed(self, links: Links, device: int) -> bool:
-        """Return whether the paths of all these links of a device are known."""
+        """Return True if the cache has the path power of all these links of a device."""
         assert links.city is not None
         known = self.powers.get(links.city, {}).get(tuple(map(float, links.device_m[device])), {})
         return all(key in known for key in _keys(links, device))
 
 
 def _keys(links: Links, device: int) -> list[int]:
-    """Return what tells links (n,) of a device apart: receivers, and the device's antenna."""
+    """Return cache keys (n,) of links: hash of the receiver position plus the antenna's number."""
     declared = links.declared
     antenna = declared.radios[device].antenna if declared.radios else None
-    number = [None, *(each for each, _ in declared.antennas)].index(antenna)
-    # Several devices may be tried at one place
+    # Several devices, with other antennas, may be tried at one position.
+    number = [None, *(known for known, _ in declared.antennas)].index(antenna)
     return (_hashes(links.receiver_m) + np.uint64(number)).tolist()
 
 
 def _through_antennas(followed: PathPowers, declared: Declared, device: int) -> np.ndarray:
-    """Return the power (n,) of the paths from a device through the antennas that are declared."""
+    """Return the path power (n,) of a device's links through the declared antennas, linear."""
     if not declared.has_antennas:
         return followed.total
     antenna_db = followed.directions.antenna_gain_db(
@@ -254,13 +259,13 @@ def _through_antennas(followed: PathPowers, declared: Declared, device: int) -> 
 
 @dataclass(frozen=True, eq=False)
 class _Likelihood:
-    """Likelihood of some links of a device, wherever it is.
+    """Likelihood of one device's links as a function of its position.
 
     Attributes:
-        fit: of links of all devices.
-        links: of all devices, with each where the law has it.
+        fit: fitted levels and error scales, from links of all devices.
+        links: links of all devices, at their positions by the law.
         rows: links of the device that take part.
-        device: its row.
+        device: row of the device.
     """
 
     fit: Fit
@@ -269,29 +274,29 @@ class _Likelihood:
     device: int
 
     def at(self, position_m: np.ndarray) -> Links:
-        """Return the links with the device at a position (2,)."""
+        """Return the device's links with the device at a position (2,) [m]."""
         device_m = self.links.device_m.copy()
         device_m[self.device, :2] = position_m
         return self.links.select(self.rows).with_devices(device_m)
 
     def problem(self, links: Links, mean_db: np.ndarray) -> CensoredRegression:
-        """Return the regression on the links, of which the channel predicts (n,)."""
+        """Return the regression on links whose channel mean (n,) [dB] is known."""
         return Model.build(links, self.fit.channel, DOF, channel_db=mean_db).regression()
 
     def nll(self, links: Links, mean_db: np.ndarray) -> float:
-        """Return the negative log-likelihood [nats]."""
+        """Return the negative log-likelihood of links with channel mean (n,) [dB], in nats."""
         return float(self.problem(links, mean_db).nll(self.fit).sum())
 
 
 @dataclass(eq=False)
 class _Search:
-    """Search for one device.
+    """Search for the position of one device along paths.
 
     Attributes:
-        by_law, by_paths: likelihood of its links.
-        relocation: its bounds, and what was followed.
+        by_law, by_paths: likelihood of its links by the log-distance law, and by paths.
+        relocation: bounds, and cache of path powers.
         tried: position -> negative log-likelihood by paths [nats].
-        strongest: position -> the candidates that matter there, of those fully followed.
+        strongest: position -> strongest candidates, where all paths were traced.
     """
 
     by_law: _Likelihood
@@ -301,30 +306,31 @@ class _Search:
     strongest: dict[_Place, Candidates] = field(default_factory=dict)
 
     def from_law(self, device: TwinDevice, known: list[tuple[float, float]]) -> TwinDevice:
-        """Return the device where paths put it, or where it is.
+        """Move a device to its likeliest position along paths, if that explains its links.
 
-        It stays if paths explain its links nowhere better than the law does there, or not as well
-        as they explain those of others.
+        It keeps its position if the law there explains them as well, or if residuals along paths
+        are much larger than those of other devices.
 
         Args:
-            device: as the law located it.
-            known: positions from other links; where there are any, only their surroundings, and the
-                law's position, are tried.
+            device: device as located by the law.
+            known: positions found from other subsets of links; if there are any, only their
+                surroundings and the law's position are tried.
         """
         start_m = np.array([device.x_m, device.y_m])
         known_m = self._free(np.array(known).reshape(-1, 2))
-        worth_m = known_m if len(known_m) else self._second_looks(self._likely_cells(device))
-        self._try([*self._free(np.round(start_m)[None]), *worth_m])
+        first_m = known_m if len(known_m) else self._second_looks(self._likely_cells(device))
+        self._try([*self._free(np.round(start_m)[None]), *first_m])
         if not self.tried:
             return device
         ranked_m = np.array(sorted(self.tried, key=self.tried.__getitem__))
-        for position_m in _apart(ranked_m, DESCENTS_APART_M, 1 if len(known_m) else DESCENTS):
+        for position_m in distinct_modes(ranked_m, -np.arange(len(ranked_m)),
+                                         1 if len(known_m) else DESCENTS, DESCENTS_APART_M):
             self._descend(position_m)
         if not len(known_m):
             self._look_around()
         best = min(self.tried, key=self.tried.__getitem__)
         view = self._view(best)
-        # Of errors that are scattered as those of other devices the median is 1.
+        # The median of squared residuals, over that of a Student-t distribution
         z = view.residual_db / view.scale_db
         misfit = np.median(z**2) / float(stdtrit(DOF, 0.75)) ** 2
         if self.tried[best] >= self._law_nll(start_m) or misfit > MAX_MISFIT:
@@ -334,23 +340,23 @@ class _Search:
                        second_mode=None)
 
     def _likely_cells(self, device: TwinDevice) -> list[np.ndarray]:
-        """Return centres of cells around a device that are worth following paths from."""
+        """Return centres (2,) [m] of the cells around a device that are likeliest by the law."""
         start_m = np.array([device.x_m, device.y_m])
         reach_m = max(REACH_RADII * device.credible_radius_m, MIN_REACH_M)
         cells_m = self._free(_cells(start_m, reach_m, self.relocation.bounds))
         order = np.argsort([self._law_nll(cell_m) for cell_m in cells_m])
         count = int(np.clip(FOLLOWED_SHARE * len(cells_m), MIN_FOLLOWED, MAX_FOLLOWED))
-        return _apart(cells_m[order], CELLS_APART_M, count)
+        return [*distinct_modes(cells_m[order], -np.arange(len(order)), count, CELLS_APART_M)]
 
     def _descend(self, from_m: np.ndarray) -> None:
-        """Go to the best of the four neighbours, and again, with shorter and shorter steps."""
+        """Descend the negative log-likelihood by paths from a position, over four neighbours."""
         best, (value,) = from_m, self._try([from_m])
         for step_m in STEPS_M:
             better = True
             while better:
                 cross = np.array([(1, 0), (-1, 0), (0, 1), (0, -1)])
                 around_m = self._free(best + step_m * cross)
-                if not all(self._is_cheap(each_m) for each_m in around_m):
+                if not all(self._is_cheap(position_m) for position_m in around_m):
                     self._find_strongest(best)
                 values = self._try(around_m)
                 better = min(values, default=np.inf) < value
@@ -358,7 +364,7 @@ class _Search:
                     best, value = around_m[np.argmin(values)], min(values)
 
     def _look_around(self) -> None:
-        """Descend from a better position around the best, as long as there is one."""
+        """Descend again from better positions on rings around the best one, while there are any."""
         better = True
         while better:
             best = min(self.tried, key=self.tried.__getitem__)
@@ -372,7 +378,7 @@ class _Search:
                 self._descend(around_m[np.argmin(values)])
 
     def _free(self, positions_m: np.ndarray) -> np.ndarray:
-        """Return those of positions (c, 2) that are within bounds and not inside a building."""
+        """Select positions (c, 2) [m] within the bounds and outside buildings."""
         west, east, south, north = self.relocation.bounds
         x_m, y_m = positions_m.T
         inside = (x_m >= west) & (x_m <= east) & (y_m >= south) & (y_m <= north)
@@ -383,17 +389,19 @@ class _Search:
         return positions_m[~links.city.inside(np.column_stack([positions_m, height_m]))]
 
     def _law_nll(self, position_m: np.ndarray) -> float:
+        """Return the negative log-likelihood by the law at a position (2,) [nats]."""
         links = self.by_law.at(position_m)
         return self.by_law.nll(links, self.by_law.fit.model.level_at(links))
 
     def _second_looks(self, positions_m: list[np.ndarray]) -> list[np.ndarray]:
-        """Return those of positions (2,) that short paths of a few links explain best."""
+        """Select the SECOND_LOOKS positions (2,) of greatest coarse likelihood."""
         if len(positions_m) <= SECOND_LOOKS:
             return positions_m
         order = np.argsort(in_threads(self._coarse_nll, positions_m), kind="stable")
         return [positions_m[place] for place in order[:SECOND_LOOKS]]
 
     def _coarse_nll(self, position_m: np.ndarray) -> float:
+        """Return the negative log-likelihood by short paths of a few links [nats]."""
         rows = self.by_paths.rows[::max(len(self.by_paths.rows) // COARSE_LINKS, 1)]
         likelihood = replace(self.by_paths, rows=rows)
         links, device = likelihood.at(position_m), likelihood.device
@@ -404,16 +412,17 @@ class _Search:
         return likelihood.nll(links, self._level_db(links, power))
 
     def _level_db(self, links: Links, power: np.ndarray) -> np.ndarray:
+        """Return the level (n,) [dB] of links from path power (n,), linear, and declared power."""
         channel, declared = self.by_paths.fit.channel, links.declared
         assert isinstance(channel, ImagePaths)
         fed_db = 0.0 if declared.adds_nothing else declared.fed_db[self.by_paths.device]
         return channel.level_db(power, links.geometry) + fed_db
 
     def _try(self, positions_m: Iterable[np.ndarray]) -> list[float]:
-        """Return the negative log-likelihood by paths of each position (2,) [nats]."""
+        """Return the negative log-likelihood by paths of each position (2,) [nats]; cached."""
         keys = [(float(x_m), float(y_m)) for x_m, y_m in positions_m]
         new = [key for key in dict.fromkeys(keys) if key not in self.tried]
-        # What one finds, others of the same call do not use: how many threads there are is all one.
+        # Results do not depend on the number of threads: a call uses candidates found before it.
         asked = [(key, self._nearby(key)) for key in new]
         for key, (nll, strongest) in zip(new, in_threads(self._paths_nll, asked), strict=True):
             self.tried[key] = nll
@@ -423,27 +432,27 @@ class _Search:
 
     def _paths_nll(self, asked: tuple[_Place, Candidates | None]
                    ) -> tuple[float, Candidates | None]:
-        """Return the negative log-likelihood [nats], and what matters if all was followed."""
+        """Return the negative log-likelihood [nats], and strongest candidates, see `follow`."""
         position_m, candidates = asked
         links = self.by_paths.at(np.array(position_m))
         power, strongest = self.relocation.follow(links, self.by_paths.device, candidates)
         return self.by_paths.nll(links, self._level_db(links, power)), strongest
 
     def _nearby(self, position_m: _Place) -> Candidates | None:
-        """Return what matters at the nearest place within `NEAR_M` that was fully followed."""
+        """Return the strongest candidates at the nearest fully traced position within `NEAR_M`."""
         away_m = {place: np.hypot(place[0] - position_m[0], place[1] - position_m[1])
                   for place in self.strongest}
         nearest = min(away_m, key=away_m.__getitem__, default=None)
         return None if nearest is None or away_m[nearest] > NEAR_M else self.strongest[nearest]
 
     def _is_cheap(self, position_m: np.ndarray) -> bool:
-        """Return whether all paths from a position (2,) are known, or those of one nearby."""
+        """Return True if a position (2,) needs no search for candidates: cached, or one is near."""
         place = float(position_m[0]), float(position_m[1])
         return self._nearby(place) is not None or self.relocation.is_followed(
             self.by_paths.at(position_m), self.by_paths.device)
 
     def _find_strongest(self, position_m: np.ndarray) -> None:
-        """Find what matters at a position (2,), where paths may have been followed before."""
+        """Find the strongest candidates at a position (2,) by tracing all its paths."""
         place, links = (float(position_m[0]), float(position_m[1])), self.by_paths.at(position_m)
         if place not in self.strongest:
             assert links.city is not None
@@ -452,7 +461,7 @@ class _Search:
                 links.frequency_hz, rays=RAYS).strongest
 
     def _view(self, best: _Place) -> ResidualView:
-        """Return the links with the device where it was found."""
+        """Return the residuals of the device's links at the best position."""
         likelihood, links = self.by_paths, self.by_paths.at(np.array(best))
         power, _ = self.relocation.follow(links, likelihood.device)
         problem = likelihood.problem(links, self._level_db(links, power))
@@ -461,9 +470,9 @@ class _Search:
                             reading.mean_db, likelihood.fit.model.level_at)
 
     def _radius_m(self, best: _Place, design_effect: float) -> float:
-        """Return the radius of a circle that holds 90 % of the probability of what was tried [m].
+        """Return the radius around the best position with 90 % of the tried positions' probability.
 
-        Each position stands for the ground that is nearer to it than to others.
+        Each position is weighted by the square of the distance to its nearest neighbour [m].
         """
         positions_m, values = np.array(list(self.tried)), np.array(list(self.tried.values()))
         apart_m = np.linalg.norm(positions_m[:, None] - positions_m, axis=2)
@@ -475,34 +484,24 @@ class _Search:
         return float(from_best_m[order][min(held, len(order) - 1)] + STEPS_M[-1])
 
 
-_Question = tuple[_Search, TwinDevice, list[tuple[float, float]]]  # where, which, known positions
+_Question = tuple[_Search, TwinDevice, list[tuple[float, float]]]  # search, device, known positions
 
 
 def _search_alone(searches: list[_Question], number: int) -> Piece:
-    """Return the result of a search by its number, as if it were the only one."""
+    """Run one search in a worker with an empty cache; return the traced paths and the device."""
     search, device, before = searches[number]
-    alone = replace(search.relocation, powers=WeakKeyDictionary())
-    found = replace(search, relocation=alone, tried={}, strongest={}).from_law(device, before)
+    relocation = replace(search.relocation, powers=WeakKeyDictionary())
+    found = replace(search, relocation=relocation, tried={}, strongest={}).from_law(device, before)
     city = search.by_law.links.city
     assert city is not None
-    return followed_since({}, alone.powers.get(city, {})), found.record
-
-
-def _apart(positions_m: np.ndarray, apart_m: float, maximum: int) -> list[np.ndarray]:
-    """Return the first of positions (c, 2) that are so far apart."""
-    chosen: list[np.ndarray] = []
-    for position_m in positions_m:
-        far = all(np.hypot(*(position_m - other_m)) >= apart_m for other_m in chosen)
-        if len(chosen) < maximum and far:
-            chosen.append(position_m)
-    return chosen
+    return followed_since({}, relocation.powers.get(city, {})), found.record
 
 
 def _cells(around_m: np.ndarray, reach_m: float,
            bounds: tuple[float, float, float, float]) -> np.ndarray:
-    """Return whole metres (c, 2) near the centres of cells within reach and about the bounds.
+    """Return centres (c, 2) of grid cells within reach of a position and the bounds, whole metres.
 
-    The grid is the same wherever it is looked at, as long as its cells need not be wider.
+    The grid is the same for all positions, unless cells must be wider because of MAX_CELLS.
     """
     low, high = np.array(bounds[::2]), np.array(bounds[1::2])
     low, high = np.maximum(around_m - reach_m, low), np.minimum(around_m + reach_m, high)
@@ -514,7 +513,7 @@ def _cells(around_m: np.ndarray, reach_m: float,
 
 
 def _hashes(positions_m: np.ndarray) -> np.ndarray:
-    """Return a hash (n,) of each position (n, 3), to the centimetre."""
+    """Hash positions (n, 3) [m], rounded to the centimetre; return (n,) uint64."""
     keys = np.round(positions_m * 100).astype(np.int64).astype(np.uint64)
     number = np.zeros(len(positions_m), dtype=np.uint64)
     for axis in range(3):

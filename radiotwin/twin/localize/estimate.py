@@ -1,4 +1,4 @@
-"""The result of a localisation: a device with an estimated position."""
+"""TwinDevice: a device with its declared or estimated position, and as JSON."""
 
 from __future__ import annotations
 
@@ -10,35 +10,35 @@ from pydantic import ConfigDict, Field, StrictBool, StrictStr, TypeAdapter, Wrap
 
 from radiotwin.io.forms import MAX_POSITION_M, Number
 
+CREDIBLE = 0.9  # posterior probability within a credible radius
 Name = Annotated[StrictStr, Field(min_length=1, max_length=1000)]
 _Coordinate = Annotated[Number, Field(ge=-MAX_POSITION_M, le=MAX_POSITION_M)]
 
 
 def _null_as(number: float) -> WrapValidator:
-    """Return what reads null as a number that JSON has no other form for."""
+    """Return a validator that reads null as NaN or infinity, which JSON cannot hold."""
     return WrapValidator(lambda value, check: number if value is None else check(value))
 
 
 @dataclass(frozen=True)
 class TwinDevice:
-    """A device, and where it is: as localisation found it, as a twin holds it, and as JSON.
+    """A device with its position, in a twin and in its file.
 
-    The types' bounds are those of files; they are checked when a record is read.
+    The bounds of types are checked when a record is read from a file.
 
     Attributes:
         device: its name.
-        x_m, y_m: declared position of an anchor; of an unknown device the mean over the heaviest
-            mode of the posterior, or the position of least expected distance [m]; NaN where nothing
-            is known of it.
-        z_m: height, as given [m].
+        x_m, y_m: declared position of an anchor; for an unknown device the mean of the heaviest
+            mode of the posterior, or the position of least expected distance [m]; NaN if unknown.
+        z_m: declared height [m].
         role: `anchor` or `unknown`.
-        located: whether the position may be relied on; always so for anchors. It is not where the
-            device was never detected, or 90 % of the posterior cover half the map or more: position
-            and radius are then the best estimate from the links that were not detected.
-        credible_radius_m: radius about the position that holds 90 % of the posterior, second modes
-            included [m]; 0 for anchors, infinite where nothing is known.
+        located: True if the position is reliable, always so for anchors. False if the device was
+            never detected, or 90 % of the posterior cover half the map or more; position and radius
+            are then estimates from links without detection.
+        credible_radius_m: radius around the position that holds 90 % of the posterior, including
+            second modes [m]; 0 for anchors, infinite if nothing is known.
         second_mode: (x_m, y_m, weight) of another mode at least 20 m away with at least 5 % of the
-            posterior; None: there is none.
+            posterior; None: no such mode.
     """
 
     device: Name
@@ -54,23 +54,23 @@ class TwinDevice:
 
     @classmethod
     def anchor(cls, device: str, x_m: float, y_m: float, z_m: float) -> TwinDevice:
-        """Return a device of declared position [m]."""
+        """Make a device with a declared position [m]."""
         return cls(device, float(x_m), float(y_m), float(z_m), "anchor", True, 0.0, None)
 
     @classmethod
     def from_record(cls, record: Any) -> TwinDevice:
-        """Return the device of a record; raises ValueError where it is no such record."""
+        """Restore a device from its `record`; raise ValueError if it is damaged."""
         return _RECORD.validate_python(record)
 
     @property
     def record(self) -> dict[str, Any]:
-        """The attributes for JSON, which has neither NaN nor infinity: they are null."""
+        """Return the attributes for JSON, with null for NaN and infinity."""
         return {name: None if isinstance(value, float) and not np.isfinite(value) else value
                 for name, value in vars(self).items()}
 
     @property
     def position_m(self) -> tuple[float, float, float]:
-        """Its coordinates x, y and z [m]."""
+        """Return x, y and z [m]."""
         return self.x_m, self.y_m, self.z_m
 
 

@@ -1,16 +1,15 @@
-"""Log-likelihood of device positions given the measurements, and how many links count as one.
+"""Likelihood of device positions, corrected for correlated errors of the channel model.
 
-A channel model that is wrong in one street is wrong in the same way at every position along it.
-Multiplying the likelihoods of all links as if they were independent then claims too small a
-credible region. The remedy here is a composite likelihood [1]: the log-likelihood is divided by the
-design effect, the factor by which correlation between residuals widens the distribution of the
-position's estimate beyond what independence would give.
+A channel model that is wrong in one street is wrong in the same way along all of it. Multiplying
+the likelihoods of all links as if they were independent then gives too small a credible region.
+The remedy is a composite likelihood [1]: the log-likelihood is divided by the design effect, the
+factor by which the correlation of residuals widens the distribution of the position's estimate.
 
 [1] Varin, Reid, Firth, "An overview of composite likelihood methods", Statistica Sinica 21, 2011,
 section 2.3.
 
-A law that was learnt from few links is wrong in the same way on all links of a device. That error
-adds to the correlation of the residuals (`LawError`).
+A law that was learnt from few links has a common error on all links of a device, which adds to the
+correlation of the residuals (`LawError`).
 """
 
 from __future__ import annotations
@@ -38,15 +37,15 @@ if TYPE_CHECKING:
     from radiotwin.scene.citymap import CityMap
 
 BIN_M, N_BINS = 20.0, 20  # width of a bin of distance [m], and number of bins
-SIGNIFICANT = 3.0  # standard errors above which a correlation is taken for real
-MAX_Z = 3.0  # an outlier counts as this many standard deviations
-MAX_POSITIONS = 1500  # of one device: memory grows with their square
-OUTLIER_SHARE = 0.02  # probability that the channel does not explain a level at all
+SIGNIFICANT = 3.0  # standard errors above which a correlation is significant
+MAX_Z = 3.0  # residuals are clipped to so many standard deviations
+MAX_POSITIONS = 1500  # receiver positions of one device: memory grows with their square
+OUTLIER_SHARE = 0.02  # probability that a level is an outlier
 OUTLIER_SPAN_DB = 100.0  # width of the outliers' uniform density: the range of plausible levels
-CHUNK_LINKS = 1 << 18  # links that are predicted at a time: bounds memory
-SLOPE_STEP_M = 2.0  # to each side, of the difference quotient of a link's mean
-# Prior standard deviation of a law's level at 100 m [dB], and of its slope [dB per decade]: what a
-# class of links that no anchor has may be off by. Laws published for cities spread by less.
+CHUNK_LINKS = 1 << 18  # links predicted at a time: bounds memory
+SLOPE_STEP_M = 2.0  # step to each side for the slope of a link's mean
+# Prior sd of errors of a law's level at 100 m [dB] and slope [dB per decade], for LoS or NLoS
+# without an anchor. Laws published for cities differ by less.
 LAW_SD_DB = 10.0
 
 
@@ -59,9 +58,9 @@ class DeviceResiduals:
         z: (n,) residuals in standard deviations.
         slope: (n, 2) change of the link's mean with the device's x and y at constant line of sight,
             in standard deviations per metre.
-        law: (n, p) error of the link's mean from each of the p independent errors of the law, in
+        law: (n, p) change of the link's mean for each of p independent errors of the law, in
             standard deviations.
-        links_per_row: detected links for each of the n that were kept.
+        links_per_row: number of detected links that a row stands for, after thinning.
     """
 
     receiver_m: np.ndarray
@@ -71,7 +70,7 @@ class DeviceResiduals:
     links_per_row: float = 1.0
 
     def thinned(self) -> DeviceResiduals:
-        """Return at most MAX_POSITIONS of them, evenly over the rows, with outliers clipped."""
+        """Keep every k-th row, so that at most MAX_POSITIONS are left, and clip outliers."""
         pick = slice(None, None, -(-len(self.z) // MAX_POSITIONS) or 1)
         return DeviceResiduals(self.receiver_m[pick], np.clip(self.z[pick], -MAX_Z, MAX_Z),
                                self.slope[pick], self.law[pick],
@@ -80,15 +79,14 @@ class DeviceResiduals:
 
 @dataclass(frozen=True, eq=False)
 class LawError:
-    """Standard error of a law's level and slope, for each class of line of sight.
+    """Standard errors of a law's level and slope in NLoS and LoS.
 
-    Whatever the form of a channel, it knows the level and the slope of its class no better than a
-    line through the same links does.
+    Any channel model is assumed to know them no better than a line fitted to the same links.
 
     Attributes:
-        by_class: whether the law distinguishes line of sight.
-        root_db: (4, 4) R, where R R' is the covariance of level at 100 m and slope per decade
-            without line of sight, then with it [dB].
+        by_class: True if the law distinguishes LoS and NLoS.
+        root_db: (4, 4) R, where R R' is the covariance of level at 100 m and slope per decade in
+            NLoS, then in LoS [dB].
     """
 
     by_class: bool
@@ -97,16 +95,16 @@ class LawError:
     @classmethod
     def learnt(cls, channel: Channel, by_class: bool, links: LinkGeometry,
                level_db: np.ndarray) -> LawError:
-        """Return the error of a channel that was learnt from n links.
+        """Estimate the standard errors of a channel that was fitted to n links.
 
-        The weighted least squares of a line, with the sandwich covariance A^-1 (sum_ij rho_ij x_i
-        x_j') A^-1 where residuals of one device are correlated between receivers.
+        Weighted least squares of a line, with the sandwich covariance A^-1 (sum_ij rho_ij x_i x_j')
+        A^-1 for residuals of one device that are correlated between receivers.
 
         Args:
-            channel: as it was learnt.
-            by_class: whether it distinguishes line of sight.
-            links: n links.
-            level_db: (n,) [dB]; NaN: not detected.
+            channel: fitted channel.
+            by_class: True if it distinguishes LoS and NLoS.
+            links: n training links.
+            level_db: (n,) measured levels [dB]; NaN: not detected.
         """
         detected = np.flatnonzero(np.isfinite(level_db))
         links, level_db = links.select(detected), level_db[detected]
@@ -119,20 +117,20 @@ class LawError:
                                          columns[rows]).thinned())
         correlation = residual_correlation(parts)
         information, covariance = np.zeros((2, 4, 4)) + np.eye(4) / LAW_SD_DB**2
-        for each in parts:
-            information += each.links_per_row * each.law.T @ each.law
-            covariance += _score_covariance(each, each.law, correlation)
+        for residuals in parts:
+            information += residuals.links_per_row * residuals.law.T @ residuals.law
+            covariance += _score_covariance(residuals, residuals.law, correlation)
         inverse = np.linalg.inv(information)
         value, vector = np.linalg.eigh(inverse @ covariance @ inverse)
         return cls(by_class, vector * np.sqrt(np.maximum(value, 0.0)))
 
     def of_links(self, links: LinkGeometry) -> np.ndarray:
-        """Return the errors (n, 4) [dB] of n links' means: R, seen by each link."""
+        """Return the change (n, 4) [dB] of n links' means for each independent error of the law."""
         return _law_columns(links, self.by_class) @ self.root_db
 
 
 def _law_columns(links: LinkGeometry, by_class: bool) -> np.ndarray:
-    """Return level and slope (n, 4) without line of sight, and with it."""
+    """Return design columns (n, 4): level and slope in NLoS, level and slope in LoS."""
     line = np.column_stack([np.ones(len(links)), np.log10(links.distance_m / 100.0)])
     los = links.los[:, None] if by_class else np.ones((len(links), 1), dtype=bool)
     return np.column_stack([line * ~los, line * los])
@@ -140,39 +138,34 @@ def _law_columns(links: LinkGeometry, by_class: bool) -> np.ndarray:
 
 def _score_covariance(residuals: DeviceResiduals, columns: np.ndarray,
                       correlation: np.ndarray) -> np.ndarray:
-    """Return sum_ij rho_ij c_i c_j' (p, p) over all links, of columns c (n, p) of those kept.
-
-    Args:
-        residuals: of the device.
-        columns: (n, p)
-        correlation: (N_BINS,) of residuals by distance, as from `residual_correlation`.
-    """
+    """Return sum_ij rho_ij c_i c_j' (p, p) of columns c (n, p) over all links of a device."""
     bins = np.minimum((squareform(pdist(residuals.receiver_m)) / BIN_M).astype(int), N_BINS)
     rho = np.append(correlation, 0.0)[bins]
-    np.fill_diagonal(rho, 1.0 / residuals.links_per_row)  # pairs of links grow with its square
+    np.fill_diagonal(rho, 1.0 / residuals.links_per_row)  # pairs grow with the square of links
     return residuals.links_per_row**2 * columns.T @ rho @ columns
 
 
 def residual_correlation(devices: list[DeviceResiduals]) -> np.ndarray:
-    """Return the correlation of residuals by distance between receivers, pooled over devices.
+    """Estimate the correlation of residuals by distance between receivers, pooled over devices.
 
     Args:
-        devices: residuals of each.
+        devices: residuals of each device.
 
     Returns:
-        (N_BINS,) in bins of BIN_M. It is 0 from the first bin on that is not above SIGNIFICANT
-        standard errors of independent residuals, so that uncorrelated data give zeros.
+        (N_BINS,) correlation in bins of BIN_M; 0 from the first bin that is not significant, so
+        that uncorrelated data give zeros.
     """
     product, pairs, square, n = np.zeros(N_BINS), np.zeros(N_BINS), 0.0, 0
-    for each in devices:
-        if len(each.z) < 2:
+    for residuals in devices:
+        z = residuals.z
+        if len(z) < 2:
             continue
-        bins = np.minimum((pdist(each.receiver_m) / BIN_M).astype(int), N_BINS)
-        first, second = np.triu_indices(len(each.z), k=1)
-        product += np.bincount(bins, each.z[first] * each.z[second], N_BINS + 1)[:N_BINS]
+        bins = np.minimum((pdist(residuals.receiver_m) / BIN_M).astype(int), N_BINS)
+        first, second = np.triu_indices(len(z), k=1)
+        product += np.bincount(bins, z[first] * z[second], N_BINS + 1)[:N_BINS]
         pairs += np.bincount(bins, minlength=N_BINS + 1)[:N_BINS]
-        square += float(each.z @ each.z)
-        n += len(each.z)
+        square += float(z @ z)
+        n += len(z)
     if n == 0 or square == 0.0:
         return np.zeros(N_BINS)
     correlation = product / np.maximum(pairs, 1) / (square / n)
@@ -181,18 +174,15 @@ def residual_correlation(devices: list[DeviceResiduals]) -> np.ndarray:
 
 
 def design_effect(residuals: DeviceResiduals, correlation: np.ndarray) -> float:
-    """Return the factor by which to divide a device's log-likelihood.
+    """Return the design effect, at least 1, by which to divide a device's log-likelihood.
 
     trace(H^-1 J) / 2 with H = sum_i a_i a_i', J = sum_ij (rho_ij + l_i l_j') a_i a_j' over the
-    slopes a and the errors l of the law: the mean widening of the position's variance; times the
-    residuals' mean square, where that is above 1 (the standard deviation is too small).
+    slopes a and the errors l of the law: the mean widening of the position's variance. Times the
+    residuals' mean square if that is above 1 (the standard deviation is too small).
 
     Args:
-        residuals: of the device.
-        correlation: (N_BINS,) as from `residual_correlation`.
-
-    Returns:
-        at least 1
+        residuals: residuals of the device.
+        correlation: (N_BINS,) correlation by distance, see `residual_correlation`.
     """
     if len(residuals.z) < 3:
         return 1.0
@@ -206,26 +196,25 @@ def design_effect(residuals: DeviceResiduals, correlation: np.ndarray) -> float:
 
 @dataclass(eq=False)
 class Likelihood:
-    """Log-likelihood of positions for devices that share one height.
+    """Log-likelihood of positions for devices of one height.
 
-    A merged level of n repeats varies about the channel's mean with the variance
-    sd^2 (1 - f) + sd^2 f / n, where sd is the channel's and f = `repeat_share` is the part of its
-    variance that is drawn anew at every measurement; the rest belongs to the position and no
-    repetition averages it out. Every level is, with probability OUTLIER_SHARE, from a uniform
-    density over OUTLIER_SPAN_DB instead, so that one link far from the model cannot outweigh all
-    others. A link that was not detected counts as P(level < limit), with the same share of
-    outliers.
+    The mean of n repeated levels has the variance sd^2 (1 - f) + sd^2 f / n around the channel's
+    mean, where f = `repeat_share` is the share of the channel's variance that is independent in
+    every measurement; the other share belongs to the position and does not average out. With
+    probability OUTLIER_SHARE a level is from a uniform density over OUTLIER_SPAN_DB, so that one
+    link far from the model cannot outweigh all others. A link that was not detected has the
+    likelihood P(level < limit), with the same share of outliers.
 
     Attributes:
-        observations: of all devices.
+        observations: observations of all devices.
         channel: predicts links to the receivers of the observations.
-        devices: (k,) indices in `observations.devices`, by which the methods identify them.
+        devices: (k,) indices in `observations.devices`, by which methods identify devices.
         z_m: height of the devices [m].
         city: 3D map; None: every link has line of sight.
-        limit_db: limit of detection [dB]; None only where nothing is `missed`.
-        law_error: of the channel; None: it is exact.
-        declared: of the devices by their index: what is in the levels beside the channel.
-        repeat_share: f, 1 until it is set.
+        limit_db: limit of detection [dB]; None only if nothing is `missed`.
+        law_error: standard errors of the channel; None: it is exact.
+        declared: declared powers, cables and antennas, added to the channel's levels.
+        repeat_share: f; 1 until it is estimated.
     """
 
     observations: Observations
@@ -239,26 +228,23 @@ class Likelihood:
     repeat_share: float = 1.0
 
     def of_devices(self, devices: Sequence[int] | np.ndarray, xy_m: np.ndarray) -> np.ndarray:
-        """Return the log-likelihood of the data of some devices at the same positions.
+        """Return the log-likelihood (k, p) [nats] of devices at the same candidate positions.
 
-        Lines of sight are computed once for all, and so is the channel where it does not
+        Line of sight is computed once for all devices, and so is the channel if it does not
         distinguish devices.
 
         Args:
             devices: (k,) indices in `observations.devices`.
-            xy_m: (p, 2) [m].
-
-        Returns:
-            (k, p) [nats]
+            xy_m: (p, 2) positions [m].
         """
-        every = [self.observations.devices[k] for k in devices]
-        rows = np.unique(np.concatenate([part for data in every
+        observed = [self.observations.devices[k] for k in devices]
+        rows = np.unique(np.concatenate([part for data in observed
                                          for part in (data.seen, data.missed)]))
-        total = np.zeros((len(every), len(xy_m)))
+        total = np.zeros((len(observed), len(xy_m)))
         step = max(1, CHUNK_LINKS // max(len(rows), 1))
         for part in (slice(start, start + step) for start in range(0, len(xy_m), step)):
             los, link = self._line_of_sight(xy_m[part], rows), None
-            for i, data in enumerate(every):
+            for i, data in enumerate(observed):
                 if link is None or self.channel.by_device:
                     link = self.channel.look_up(xy_m[part], rows, los, data.device)
                 mean_db, sd_db = link
@@ -267,7 +253,7 @@ class Likelihood:
         return total
 
     def link_at(self, k: int, xy_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the channel between one position of a device and the receivers that detected it.
+        """Predict the links between one position of a device and the receivers that detected it.
 
         Args:
             k: index in `observations.devices`.
@@ -313,14 +299,7 @@ class Likelihood:
 
     def _with_declared(self, mean_db: np.ndarray, xy_m: np.ndarray, rows: np.ndarray,
                        device: int) -> np.ndarray:
-        """Return the channel's mean (p, c) with what is declared of a device [dB].
-
-        Args:
-            mean_db: (p, c) [dB].
-            xy_m: (p, 2) positions of the device [m].
-            rows: (c,) of the receivers.
-            device: its index.
-        """
+        """Add a device's declared power, cable and antenna gain to the mean (p, c) [dB]."""
         if self.declared.adds_nothing:
             return mean_db
         ends_m = np.column_stack([xy_m, np.full(len(xy_m), self.z_m)])
@@ -329,7 +308,7 @@ class Likelihood:
         return mean_db + np.reshape(added_db, mean_db.shape).astype(np.float32)
 
     def _line_of_sight(self, xy_m: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Return line of sight (p, c) between positions (p, 2) and rows (c,) of the receivers."""
+        """Return the line of sight (p, c) from positions (p, 2) [m] to receivers `rows` (c,)."""
         p, c = len(xy_m), len(rows)
         if self.city is None:
             return np.ones((p, c), bool)
@@ -339,13 +318,12 @@ class Likelihood:
 
     def _score(self, data: DeviceObservations, rows: np.ndarray, mean_db: np.ndarray,
                sd_db: np.ndarray) -> np.ndarray:
-        """Return the log-likelihood (p,) given the channel (p, c) at rows (c,) of the receivers."""
+        """Return a device's log-likelihood (p,) from mean and sd (p, c) at receivers `rows`."""
         total = np.zeros(len(mean_db))
         if len(data.seen):
             columns = _columns(rows, data.seen)
             scale = np.sqrt(self.variance_share(data.count)).astype(np.float32)
-            # log[(1 - e) N(level) + e / span] as log(e / span) + log(1 + ratio), ratio >= 0: no
-            # cancellation.
+            # log[(1 - e) N(level) + e / span] = log(e / span) + log(1 + ratio): no cancellation
             merged_sd_db = sd_db[:, columns] * scale
             ratio = (data.level_db.astype(np.float32) - mean_db[:, columns]) / merged_sd_db
             ratio *= ratio
@@ -358,8 +336,7 @@ class Likelihood:
             total += len(data.seen) * np.log(OUTLIER_SHARE / OUTLIER_SPAN_DB)
         if len(data.missed):
             columns = _columns(rows, data.missed)
-            # k misses at one position count k only as far as repeats are independent (design
-            # effect).
+            # k misses at one position count k only if repeats are independent (design effect).
             weight = data.missed_count / (1 + (data.missed_count - 1) * (1 - self.repeat_share))
             below = ndtr((np.float32(self.limit_db) - mean_db[:, columns]) / sd_db[:, columns])
             below *= np.float32(1 - OUTLIER_SHARE)
@@ -369,4 +346,5 @@ class Likelihood:
 
 
 def _columns(rows: np.ndarray, wanted: np.ndarray) -> np.ndarray | slice:
+    """Return the places of `wanted` in the sorted `rows`."""
     return slice(None) if len(rows) == len(wanted) else np.searchsorted(rows, wanted)

@@ -1,7 +1,7 @@
-"""Measurements merged over repeats, and what a channel predicts of very many positions.
+"""Merge repeated measurements, and predict a channel for millions of candidate positions.
 
-There is one entry for each device and receiver position. Predictions are looked up in a table where
-the channel allows it.
+Observations have one entry for each device and receiver position. Predictions are looked up in a
+table if the channel depends on distance, height difference and line of sight only.
 """
 
 from __future__ import annotations
@@ -13,31 +13,31 @@ import numpy as np
 
 from radiotwin.links import LinkGeometry
 
-SAME_POSITION_M = 1e-3  # positions that round to the same multiple are one [m]
-MAX_LEVELS = 256  # differences in height that a table distinguishes
-NODES = 1024  # of each row of a table, over the horizontal distance
-NEAR_M = 5.0  # softens the logarithmic axis below this horizontal distance [m]
+SAME_POSITION_M = 1e-3  # positions that round to the same multiple are equal
+MAX_LEVELS = 256  # height differences that a table distinguishes
+NODES = 1024  # nodes of each row of a table, over the horizontal distance
+NEAR_M = 5.0  # the logarithmic axis of a table is compressed below this horizontal distance
 PROBES = 40  # positions at which a table is checked, each to as many receivers
-MEAN_TOLERANCE_DB = 0.05  # of a table's mean: an order below the sd of any channel
-SD_TOLERANCE = 0.02  # of its standard deviation, relative
-MIN_SD_DB = 0.1  # of a channel: the likelihood divides by it
-PREDICT_CHUNK = 200_000  # links that are predicted at a time: bounds memory
+MEAN_TOLERANCE_DB = 0.05  # error of a table's mean: far below the sd of any channel
+SD_TOLERANCE = 0.02  # relative error of its standard deviation
+MIN_SD_DB = 0.1  # least standard deviation, since the likelihood divides by it
+PREDICT_CHUNK = 200_000  # links predicted at a time: bounds memory
 
 
 @dataclass(frozen=True)
 class DeviceObservations:
     """One device's measurements, merged over repeats of the same receiver position.
 
-    A position where some were detected and some were not is in both `seen` and `missed`.
+    A position with detected and undetected measurements is in both `seen` and `missed`.
 
     Attributes:
-        device: its index, as the channel knows it.
+        device: index of the device in the channel's links.
         seen: (n,) rows of `Observations.receiver_m` with detected measurements.
-        level_db: (n,) their mean level [dB].
-        count: (n,) detected measurements of each.
-        squares: (n,) sum of squares about that mean [dB^2].
-        missed: (m,) rows with measurements that were not detected; empty where no limit is known.
-        missed_count: (m,) such measurements of each.
+        level_db: (n,) mean level of the detected measurements [dB].
+        count: (n,) number of detected measurements.
+        squares: (n,) sum of squared deviations from the mean [dB²].
+        missed: (m,) rows with undetected measurements; empty if the limit is unknown.
+        missed_count: (m,) number of undetected measurements.
     """
 
     device: int
@@ -50,7 +50,7 @@ class DeviceObservations:
 
     @property
     def usable(self) -> bool:
-        """Whether anything bears on the position."""
+        """Return True if there is any measurement that depends on the position."""
         return len(self.seen) + len(self.missed) > 0
 
 
@@ -72,14 +72,11 @@ def merge_repeats(receiver_m: np.ndarray, device: np.ndarray, level_db: np.ndarr
     """Merge the measurements of each device at each receiver position (equal to the millimetre).
 
     Args:
-        receiver_m: (n, 3) [m].
-        device: (n,) int, device of each measurement.
-        level_db: (n,) [dB]; NaN: not detected.
-        devices: (k,) int, the devices that are wanted; rows of others are not used.
-        use_missed: whether links that were not detected are used.
-
-    Returns:
-        observations, with the devices in the order of `devices`.
+        receiver_m: (n, 3) positions of the receivers [m].
+        device: (n,) device index of each measurement.
+        level_db: (n,) levels [dB]; NaN: not detected.
+        devices: (k,) indices of the devices to keep, in this order.
+        use_missed: keep measurements that were not detected.
     """
     rows = np.isin(device, devices)
     receiver_m, device, level_db = receiver_m[rows], device[rows], level_db[rows]
@@ -93,6 +90,7 @@ def merge_repeats(receiver_m: np.ndarray, device: np.ndarray, level_db: np.ndarr
 
 def _merge(device: int, position: np.ndarray, level_db: np.ndarray,
            use_missed: bool) -> DeviceObservations:
+    """Merge one device's levels (n,) [dB] at indices (n,) of receiver positions."""
     detected = ~np.isnan(level_db)
     seen, group, count = np.unique(position[detected], return_inverse=True, return_counts=True)
     level = level_db[detected]
@@ -111,11 +109,11 @@ class Channel(Protocol):
 
 
 class LinkTable:
-    """Predictions for devices at one height by horizontal distance, height difference and LoS.
+    """Table of predictions for devices at one height, by horizontal distance, rise and LoS.
 
-    For each difference in height between receiver and device (up to `MAX_LEVELS`) and each of NLoS,
-    LoS there is a row over the horizontal distance rho, with NODES nodes evenly spaced in
-    log(rho^2 + NEAR_M^2), in which a log-distance law is close to straight; values between nodes
+    For each height difference between receiver and device (up to `MAX_LEVELS`), and NLoS and LoS,
+    there is a row of NODES values over the horizontal distance rho. Nodes are evenly spaced in
+    log(rho^2 + NEAR_M^2), over which a log-distance law is nearly straight; values between nodes
     are interpolated linearly.
     """
 
@@ -151,13 +149,13 @@ class LinkTable:
 
     def look_up(self, xy_m: np.ndarray, rows: np.ndarray, los: np.ndarray,
                 device: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the prediction of links between p device positions and c receivers.
+        """Look up the prediction of links between p device positions and c receivers.
 
         Args:
             xy_m: (p, 2) positions of the device [m].
             rows: (c,) receivers, as rows of `receiver_m`.
             los: (p, c) bool, line of sight.
-            device: index of the device; not used, a table holds for all devices.
+            device: index of the device; not used, since a table is for all devices.
 
         Returns:
             (p, c) float32 mean [dB], and (p, c) float32 standard deviation [dB].
@@ -181,10 +179,10 @@ class LinkTable:
 
 
 class DirectChannel:
-    """Predictions of a channel that depends on more, such as position, azimuth, or the device.
+    """Predictions of a channel without a table, such as one that depends on position or device.
 
     Attributes:
-        by_device: whether predictions differ between devices at one position.
+        by_device: True if predictions differ between devices at one position.
     """
 
     def __init__(self, channel: Channel, receiver_m: np.ndarray, z_m: float,
@@ -194,22 +192,17 @@ class DirectChannel:
 
     def look_up(self, xy_m: np.ndarray, rows: np.ndarray, los: np.ndarray,
                 device: int) -> tuple[np.ndarray, np.ndarray]:
-        """Predict as `LinkTable.look_up` does; `device` is passed on to the channel."""
+        """Predict links between p device positions and c receivers; see `LinkTable.look_up`."""
         links = link_grid(xy_m, self._z_m, self._receiver_m[rows], los, device)
         mean_db, sd_db = predict_in_chunks(self._channel, links)
         return (mean_db.reshape(los.shape).astype(np.float32),
                 sd_db.reshape(los.shape).astype(np.float32))
 
 
-def tabulate(
-    channel: Channel,
-    receiver_m: np.ndarray,
-    z_m: float,
-    bounds: tuple[float, float, float, float],
-    devices: np.ndarray,
-    rng: np.random.Generator,
-) -> LinkTable | DirectChannel:
-    """Return a table if it repeats the channel's predictions at random links of this problem.
+def tabulate(channel: Channel, receiver_m: np.ndarray, z_m: float,
+             bounds: tuple[float, float, float, float], devices: np.ndarray,
+             rng: np.random.Generator) -> LinkTable | DirectChannel:
+    """Tabulate a channel if a table reproduces its predictions at random links.
 
     Args:
         channel: to tabulate.
@@ -220,8 +213,8 @@ def tabulate(
         rng: random state.
 
     Returns:
-        a table where all predictions agree to MEAN_TOLERANCE_DB and SD_TOLERANCE, the channel
-        itself where not.
+        a table if all predictions agree to MEAN_TOLERANCE_DB and SD_TOLERANCE; otherwise the
+        channel itself.
     """
     x_min, x_max, y_min, y_max = bounds
     corners = np.array([[x, y] for x in (x_min, x_max) for y in (y_min, y_max)])
@@ -232,20 +225,21 @@ def tabulate(
         rows = rng.integers(len(receiver_m), size=PROBES)
         los = rng.random((PROBES, PROBES)) < 0.5
         links = link_grid(xy_m, z_m, receiver_m[rows], los, device)
-        mean_db, sd_db = (each.reshape(los.shape) for each in predict_in_chunks(channel, links))
+        mean_db, sd_db = (values.reshape(los.shape)
+                          for values in predict_in_chunks(channel, links))
         table_mean_db, table_sd_db = table.look_up(xy_m, rows, los, device)
         exact &= bool((np.abs(table_mean_db - mean_db) < MEAN_TOLERANCE_DB).all())
         exact &= bool((np.abs(table_sd_db - sd_db) <= SD_TOLERANCE * sd_db).all())
-        as_first = predict_in_chunks(
+        of_first = predict_in_chunks(
             channel, link_grid(xy_m, z_m, receiver_m[rows], los, devices[0]))
-        by_device |= not all(np.allclose(own.ravel(), first)
-                             for own, first in zip((mean_db, sd_db), as_first, strict=True))
+        by_device |= not all(np.allclose(values.ravel(), first)
+                             for values, first in zip((mean_db, sd_db), of_first, strict=True))
     return table if exact else DirectChannel(channel, receiver_m, z_m, by_device)
 
 
 def link_grid(xy_m: np.ndarray, z_m: float, receiver_m: np.ndarray, los: np.ndarray,
               device: int) -> LinkGeometry:
-    """Return links from every position of a device to every receiver, positions slowest.
+    """Pair every position of a device with every receiver, positions slowest.
 
     Args:
         xy_m: (p, 2) positions of the device [m].
@@ -263,10 +257,10 @@ def link_grid(xy_m: np.ndarray, z_m: float, receiver_m: np.ndarray, los: np.ndar
 
 
 def predict_in_chunks(channel: Channel, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
-    """Return `channel.predict` with bounded memory, and at least MIN_SD_DB as deviation."""
+    """Predict links in chunks to bound memory; clip the standard deviation to MIN_SD_DB or more."""
     if not len(links):
         return np.zeros(0), np.zeros(0)
     parts = [channel.predict(links.select(slice(start, start + PREDICT_CHUNK)))
              for start in range(0, len(links), PREDICT_CHUNK)]
-    mean_db, sd_db = (np.concatenate(each) for each in zip(*parts, strict=True))
+    mean_db, sd_db = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     return mean_db, np.maximum(sd_db, MIN_SD_DB)

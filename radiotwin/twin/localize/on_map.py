@@ -1,7 +1,7 @@
-"""Positions of unknown devices from the levels that receivers at known positions measured.
+"""Locate unknown devices from levels at known receiver positions: scan, particle swarms, posterior.
 
-The likelihood of a device's data is scanned over all of the map where it may be. Particle swarms,
-of all devices in one batch, then search for the most likely positions.
+The likelihood of a device's data is scanned over the allowed area. Particle swarms, of all devices
+in one batch, then search for the most likely positions.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from radiotwin.scene.citymap import CityMap
 
 Bounds = tuple[float, float, float, float]  # x_min, x_max, y_min, y_max [m]
-DIRECT_SAVING = 8  # times fewer links where predicting one takes ten times longer than a look-up
-# Points of a cell that are tried for one where a device may be, from its centre, in cell widths.
+DIRECT_SAVING = 8  # factor fewer links without a table: a prediction takes ten times a look-up
+# Points of a cell that are tried until one is allowed, relative to the centre, in cell widths.
 POINTS_OF_CELL = np.array([[0, 0], [0.35, 0], [-0.35, 0], [0, 0.35], [0, -0.35],
                            [0.35, 0.35], [-0.35, 0.35], [0.35, -0.35], [-0.35, -0.35]])
 # Clerc & Kennedy 2002, "The particle swarm: explosion, stability, and convergence in a
@@ -47,9 +47,9 @@ POINTS_OF_CELL = np.array([[0, 0], [0.35, 0], [-0.35, 0], [0, 0.35], [0, -0.35],
 # chi (v + 2.05 u1 (own best - x) + 2.05 u2 (swarm's best - x)).
 PHI_EACH = 2.05
 CONSTRICTION = 2.0 / (2 * PHI_EACH - 2.0 + np.sqrt((2 * PHI_EACH) ** 2 - 8 * PHI_EACH))
-COARSE_SCAN = 2.0  # factor on the cells of the scan that only serves `_set_repeat_share`
-MODE_SPACING_CELLS = 4.0  # least distance of a device's swarms at the start, in cells of the scan
-VAGUE_SHARE = 0.5  # of the map: a device with a larger credible region is not located
+COARSE_SCAN = 2.0  # factor on the cell width of the scan for `_set_repeat_share`
+MODE_SPACING_CELLS = 4.0  # least distance between starts of a device's swarms, in cells of the scan
+VAGUE_SHARE = 0.5  # share of the map: a device with a larger credible region is not located
 
 
 @dataclass(frozen=True)
@@ -58,11 +58,11 @@ class LocalizeSettings:
 
     Attributes:
         scan_step_m: width of a cell of the first scan over the map [m].
-        scan_links: links that the scan may evaluate, beyond which its cells grow.
-        swarms: number for each device.
-        particles: of each swarm.
-        iterations: of every swarm.
-        allow_indoor: whether a device may be inside a building.
+        scan_links: most links that the scan evaluates; beyond it, its cells grow.
+        swarms: swarms of each device.
+        particles: particles of each swarm.
+        iterations: iterations of each swarm.
+        allow_indoor: True if a device may be inside a building.
     """
 
     scan_step_m: float = 5.0
@@ -75,15 +75,15 @@ class LocalizeSettings:
 
 @dataclass(frozen=True)
 class Scan:
-    """Log-likelihoods over a grid of square cells, which covers the bounds.
+    """Log-likelihoods over a grid of square cells that covers the bounds.
 
-    Cells without a point where a device may be are left out.
+    Cells without an allowed point are left out.
 
     Attributes:
         centre_m: (c, 2) centres of the cells [m].
-        width_m: of every cell [m].
-        point_m: (c, 2) point of each cell where a device may be, at which it was evaluated [m].
-        value: (k, c) log-likelihood of each of the search's devices [nats].
+        width_m: width of the cells [m].
+        point_m: (c, 2) allowed point of each cell, at which it was evaluated [m].
+        value: (k, c) log-likelihood of each device of the search [nats].
     """
 
     centre_m: np.ndarray
@@ -94,12 +94,12 @@ class Scan:
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """Devices of one height, with their data, on a map.
+    """Search for devices of one height.
 
     Attributes:
-        likelihood: of their data.
-        bounds: within which they are.
-        settings: of the search.
+        likelihood: likelihood of their positions.
+        bounds: bounds of their positions [m].
+        settings: extent of the search.
     """
 
     likelihood: Likelihood
@@ -107,25 +107,22 @@ class Search:
     settings: LocalizeSettings
 
     def allowed(self, xy_m: np.ndarray) -> np.ndarray:
-        """Return whether (p,) a device may be at positions (p, 2) [m]."""
+        """Return (p,) bool: a device may be at the position (p, 2) [m]."""
         x_min, x_max, y_min, y_max = self.bounds
         city, z_m = self.likelihood.city, self.likelihood.z_m
         x, y = xy_m.T
         allowed = (x >= x_min) & (x <= x_max) & (y >= y_min) & (y <= y_max)
         if city is not None and not self.settings.allow_indoor and allowed.any():
-            at = np.column_stack([xy_m[allowed], np.full(allowed.sum(), z_m)])
-            allowed[allowed] = ~city.inside(at)
+            position_m = np.column_stack([xy_m[allowed], np.full(allowed.sum(), z_m)])
+            allowed[allowed] = ~city.inside(position_m)
         return allowed
 
     def log_likelihood(self, k: int, xy_m: np.ndarray) -> np.ndarray:
-        """Return the log-likelihood of one device's data at positions.
+        """Return the log-likelihood (p,) of one device at positions [nats]; -inf: not allowed.
 
         Args:
             k: index in `Observations.devices`.
-            xy_m: (p, 2) [m].
-
-        Returns:
-            (p,) [nats]; -inf where the device may not be.
+            xy_m: (p, 2) positions [m].
         """
         value = np.full(len(xy_m), -np.inf)
         allowed = self.allowed(xy_m)
@@ -140,11 +137,8 @@ class Search:
         Args:
             coarser: factor on the width of the cells.
 
-        Returns:
-            log-likelihoods
-
         Raises:
-            BadInput: there is no point outside buildings.
+            BadInput: no point is allowed.
         """
         x_min, x_max, y_min, y_max = self.bounds
         is_direct = isinstance(self.likelihood.channel, DirectChannel)
@@ -171,23 +165,23 @@ class Search:
 
 
 def _centres(low: float, high: float, width: float) -> np.ndarray:
-    """Return centres, all inside, of cells that cover an interval and overhang both ends alike."""
+    """Return the centres of cells that cover an interval, with equal overhang at both ends."""
     n = max(1, int(np.ceil((high - low) / width - 1e-9)))
     return (low + high) / 2 + (np.arange(n) - (n - 1) / 2) * width
 
 
 def distinct_modes(xy_m: np.ndarray, log_likelihood: np.ndarray, n_modes: int,
                    separation_m: float) -> np.ndarray:
-    """Return the best of scanned positions that keep a distance from each other.
+    """Choose the likeliest of scanned positions that are far enough from each other.
 
     Args:
         xy_m: (p, 2) positions [m].
-        log_likelihood: (p,) [nats]; -inf where no device may be.
-        n_modes: number of positions, at most.
+        log_likelihood: (p,) [nats]; -inf: not allowed.
+        n_modes: greatest number of positions.
         separation_m: least distance between two of them [m].
 
     Returns:
-        (at most n_modes, 2) [m], best first.
+        (at most n_modes, 2) positions [m], likeliest first.
     """
     modes = np.empty((0, 2))
     left = np.isfinite(log_likelihood)
@@ -198,31 +192,24 @@ def distinct_modes(xy_m: np.ndarray, log_likelihood: np.ndarray, n_modes: int,
     return modes
 
 
-def swarm_search(
-    log_likelihood: Callable[[np.ndarray, np.ndarray], np.ndarray],
-    centre_m: np.ndarray,
-    device: np.ndarray,
-    anywhere_m: np.ndarray,
-    start_sd_m: float,
-    particles: int,
-    iterations: int,
-    rng: np.random.Generator,
-    advance: Callable[[int], None] = lambda n: None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Run s swarms and return the best position that each found.
+def swarm_search(log_likelihood: Callable[[np.ndarray, np.ndarray], np.ndarray],
+                 centre_m: np.ndarray, device: np.ndarray, anywhere_m: np.ndarray,
+                 start_sd_m: float, particles: int, iterations: int, rng: np.random.Generator,
+                 advance: Callable[[int], None] = lambda n: None) -> tuple[np.ndarray, np.ndarray]:
+    """Run s particle swarms, and return the best position that each of them found.
 
-    Two thirds of a swarm start around its centre, the first particle at the centre itself, and the
-    others anywhere, so that a swarm can leave a poor mode.
+    Two thirds of a swarm start around its centre, the first particle at the centre itself; the
+    others start anywhere, so that a swarm can leave a poor mode.
 
     Args:
-        log_likelihood: maps positions (p, 2) and devices (p,) to (p,) [nats], -inf where no device
-            may be.
-        centre_m: (s, 2) start of each swarm [m].
-        device: (s,) device that each swarm looks for.
-        anywhere_m: (a, 2) positions where the other third may start [m].
-        start_sd_m: standard deviation of starts around a centre [m].
-        particles: of each swarm.
-        iterations: of every swarm.
+        log_likelihood: function from positions (p, 2) [m] and devices (p,) to (p,) [nats]; -inf:
+            not allowed.
+        centre_m: (s, 2) centre of each swarm [m].
+        device: (s,) device that each swarm searches.
+        anywhere_m: (a, 2) positions from which the last third of the starts is drawn [m].
+        start_sd_m: standard deviation of starts around the centre [m].
+        particles: particles of each swarm.
+        iterations: iterations of each swarm.
         rng: random state.
         advance: called with 1 after each iteration.
 
@@ -250,53 +237,40 @@ def swarm_search(
     return own_best[np.arange(s), best], own_value[np.arange(s), best]
 
 
-def localize(
-    receiver_m: np.ndarray,
-    device: np.ndarray,
-    level_db: np.ndarray,
-    channel: Channel,
-    *,
-    devices: Mapping[int, str],
-    bounds: Bounds,
-    z_m: np.ndarray | float,
-    city: CityMap | None = None,
-    limit_db: float | None = None,
-    seed: int,
-    settings: LocalizeSettings | None = None,
-    start_m: np.ndarray | None = None,
-    law_error: LawError | None = None,
-    declared: Declared = NOTHING,
-) -> list[TwinDevice]:
-    """Estimate every device's position with the channel as it is.
+def localize(receiver_m: np.ndarray, device: np.ndarray, level_db: np.ndarray, channel: Channel, *,
+             devices: Mapping[int, str], bounds: Bounds, z_m: np.ndarray | float,
+             city: CityMap | None = None, limit_db: float | None = None, seed: int,
+             settings: LocalizeSettings | None = None, start_m: np.ndarray | None = None,
+             law_error: LawError | None = None, declared: Declared = NOTHING) -> list[TwinDevice]:
+    """Locate unknown devices from measured levels by a fitted channel.
 
-    Repeated measurements are merged (`Observations`, `Likelihood`); the map is scanned with every
-    device's data; several swarms a device start at the best distinct modes (`swarm_search`); the
-    cells that the scan or a swarm found good are split down to 0.3 m or less, and the posterior
-    over them, with a power of the likelihood that corrects for correlated model error
-    (`overconfidence`), gives position, radius and second mode.
+    Repeated measurements are merged (`Observations`, `Likelihood`). The likelihood is scanned over
+    the map; for each device, several swarms start at the best distinct modes (`swarm_search`). The
+    best cells of scan and swarms are split down to 0.3 m or less. The posterior over them, with the
+    likelihood divided by the design effect of correlated model errors, gives position, radius and
+    second mode.
 
     Args:
         receiver_m: (n, 3) positions of the receivers [m].
-        device: (n,) int, device of each measurement.
+        device: (n,) device index of each measurement.
         level_db: (n,) gain [dB] or received power [dBm]; NaN: not detected.
-        channel: fitted, with the same device indices in its links.
-        devices: index and name of the k devices to locate; rows of others are not used.
-        bounds: x_min, x_max, y_min, y_max within which they are [m].
-        z_m: their heights, (k,) or one for all [m].
+        channel: fitted channel with the same device indices in its links.
+        devices: index and name of the k devices to locate; other devices are not used.
+        bounds: x_min, x_max, y_min, y_max of their positions [m].
+        z_m: heights of the devices, (k,) or one for all [m].
         city: 3D map; None: every link has line of sight.
-        limit_db: level below which the receiver does not detect [dB]; None: unknown, links that
-            were not detected are left out.
+        limit_db: limit of detection [dB]; None: unknown, undetected links are left out.
         seed: of the swarms; the same seed gives the same estimates.
-        settings: of the search; None: the defaults.
-        start_m: (k, 2) an earlier estimate of each, where one more swarm starts [m]; NaN: none.
-        law_error: of the channel, which widens the radii; None: it is exact.
-        declared: of the devices by their index: what is in the levels beside the channel.
+        settings: extent of the search; None: the defaults.
+        start_m: (k, 2) earlier estimates, where an additional swarm starts [m]; NaN: none.
+        law_error: standard errors of the channel, which widen the radii; None: it is exact.
+        declared: declared powers, cables and antennas of the devices, by their index.
 
     Returns:
         the devices in their order.
 
     Raises:
-        BadInput: buildings leave no position.
+        BadInput: all positions are inside buildings.
     """
     settings = settings or LocalizeSettings()
     z_m = np.broadcast_to(z_m, len(devices))
@@ -337,10 +311,10 @@ def localize(
 
 
 def _set_repeat_share(searches: list[Search], observations: Observations) -> None:
-    """Set the share of the channel's variance that is drawn anew at each repeat.
+    """Estimate `Likelihood.repeat_share` by a one-way analysis of variance, and set it.
 
-    A one-way analysis of variance: the variance within positions over the channel's variance at the
-    devices' roughly best positions.
+    It is the variance within positions over the channel's variance at the devices' approximate
+    positions.
     """
     repeats = sum(int((data.count - 1).sum()) for data in observations.devices)
     if repeats == 0:
@@ -355,15 +329,10 @@ def _set_repeat_share(searches: list[Search], observations: Observations) -> Non
         search.likelihood.repeat_share = min(1.0, within / repeats)
 
 
-def _run_swarms(
-    searches: list[Search],
-    scans: list[Scan],
-    start_m: np.ndarray,
-    settings: LocalizeSettings,
-    rng: np.random.Generator,
-    advance: Callable[[int], None],
-) -> dict[int, np.ndarray]:
-    """Return the best positions (s, 2) [m] of each device's swarms, best first."""
+def _run_swarms(searches: list[Search], scans: list[Scan], start_m: np.ndarray,
+                settings: LocalizeSettings, rng: np.random.Generator, advance: Callable[[int], None]
+                ) -> dict[int, np.ndarray]:
+    """Run the swarms of all devices; return for each device their best positions (s, 2) [m]."""
     search_of = {k: search for search in searches for k in search.likelihood.devices}
     centres, whose = [], []
     for search, scan in zip(searches, scans, strict=True):
@@ -391,6 +360,7 @@ def _run_swarms(
 
 def _estimate(data: DeviceObservations, name: str, z_m: float,
               found: tuple[Posterior, Search] | None) -> TwinDevice:
+    """Return a device with position, radius and second mode of its posterior; None: no data."""
     x_m = y_m = np.nan
     radius_m, other, located = np.inf, None, False
     if found is not None:

@@ -1,4 +1,4 @@
-"""Posterior of a position: log-likelihoods refined to modes and a credible radius."""
+"""Posterior of a device's position: refine cells, find modes and the credible radius."""
 
 from __future__ import annotations
 
@@ -8,24 +8,25 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import label
 
-CREDIBLE_MASS = 0.9  # posterior probability of a credible region
+from radiotwin.twin.localize.estimate import CREDIBLE
+
 SPLIT = 5  # a cell becomes SPLIT x SPLIT cells
-MAX_SPLIT_CELLS = 80  # cells of highest likelihood that are split at once
-FINEST_M = 0.3  # width below which cells are not split [m]
-MODE_FLOOR = 1e-3  # mass of a cell over the heaviest cell's, below which it is in no mode
-MIN_MODE_WEIGHT = 0.05  # posterior probability of a second mode that is reported
-MODE_SEPARATION_M = 20.0  # its least distance from the first [m]
+MAX_SPLIT_CELLS = 80  # cells of highest likelihood that are split in a step
+FINEST_M = 0.3  # narrower cells are not split
+MODE_FLOOR = 1e-3  # a cell with less mass, over the heaviest cell's, belongs to no mode
+MIN_MODE_WEIGHT = 0.05  # least posterior probability of a reported second mode
+MODE_SEPARATION_M = 20.0  # its least distance from the first mode
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """Square cells that tile the part of the map where a device may be, small where it is likely.
+    """Posterior over square cells that tile the allowed area, finer where a device is likely.
 
     Attributes:
-        xy_m: (c, 2) point of each cell where a device may be [m].
-        cell_m: (c, 2) centre of the scan's cell that it is part of [m].
-        width_m: (c,) [m].
-        log_likelihood: (c,) [nats].
+        xy_m: (c, 2) allowed point of each cell [m].
+        cell_m: (c, 2) centre of the scan's cell that contains it [m].
+        width_m: (c,) width of each cell [m].
+        log_likelihood: (c,) log-likelihood at the point [nats].
         mass: (c,) posterior probability under a uniform prior and a power of the likelihood; sums
             to 1.
     """
@@ -37,35 +38,34 @@ class Posterior:
     mass: np.ndarray
 
     def radius(self, xy_m: np.ndarray) -> float:
-        """Return the radius [m] about a position (2,) that holds CREDIBLE_MASS."""
+        """Return the radius [m] around a position (2,) that holds the probability CREDIBLE."""
         distance = np.linalg.norm(self.xy_m - xy_m, axis=1)
-        # The mass of a cell is spread over it: half of it is nearer than its centre, half farther.
+        # The mass of a cell is spread over it: half is nearer than its centre, half farther.
         halves = np.concatenate([distance - self.width_m / 4, distance + self.width_m / 4])
         order = np.argsort(halves)
         within = np.cumsum(np.tile(self.mass, 2)[order] / 2)
-        return float(halves[order][np.searchsorted(within, CREDIBLE_MASS * (1 - 1e-9))])
+        return float(halves[order][np.searchsorted(within, CREDIBLE * (1 - 1e-9))])
 
     def region_share(self) -> float:
-        """Return the share of the area of the smallest region with CREDIBLE_MASS; 0.9: flat."""
+        """Return the area of the smallest region with probability CREDIBLE over that of all cells.
+
+        It is 0.9 for a flat posterior.
+        """
         area = self.width_m**2
         order = np.argsort(-self.mass / area)
-        inside = np.searchsorted(np.cumsum(self.mass[order]), CREDIBLE_MASS * (1 - 1e-9)) + 1
+        inside = np.searchsorted(np.cumsum(self.mass[order]), CREDIBLE * (1 - 1e-9)) + 1
         return float(area[order][:inside].sum() / area.sum())
 
     def modes(self, allowed: Callable[[np.ndarray], np.ndarray]) -> list[tuple[np.ndarray, float]]:
         """Return position (2,) [m] and weight of each separate mode, heaviest first.
 
-        A mode is a connected patch of the scan's grid whose cells hold at least MODE_FLOOR of the
-        heaviest cell's mass. Its position is the mean over it under the likelihood itself: a power
-        widens a posterior, it does not move a composite likelihood's estimate. Where a device may
-        not be at the mean, or a crescent's mean falls beside it, it is the patch's most likely
-        point.
+        A mode is a connected patch of the scan's grid whose cells have at least MODE_FLOOR of the
+        heaviest cell's mass. Its position is its mean under the likelihood itself: a power widens
+        the posterior of a composite likelihood, but does not move its estimate. If the mean is not
+        allowed, or outside the patch, such as a crescent, it is the patch's most likely point.
 
         Args:
-            allowed: maps positions (p, 2) to (p,) bool, whether a device may be there.
-
-        Returns:
-            pairs of position and weight
+            allowed: function from positions (p, 2) [m] to (p,) bool, a device may be there.
         """
         offset = (self.cell_m - self.cell_m.min(axis=0)) / self.width_m.max()
         column, row = np.round(offset).astype(int).T
@@ -77,25 +77,25 @@ class Posterior:
         weights[0] = 0.0
         found = []
         for k in np.argsort(-weights)[: np.count_nonzero(weights)]:
-            mine = patch == k
-            height = self.log_likelihood[mine]
-            share = self.width_m[mine] ** 2 * np.exp(height - height.max())
-            mean = share @ self.xy_m[mine] / share.sum()
-            beside = np.abs(self.cell_m[mine] - mean).max(axis=1).min() > self.width_m.max() / 2
-            if beside or not allowed(mean[None])[0]:
-                mean = self.xy_m[mine][height.argmax()]
+            cells = patch == k
+            height = self.log_likelihood[cells]
+            share = self.width_m[cells] ** 2 * np.exp(height - height.max())
+            mean = share @ self.xy_m[cells] / share.sum()
+            outside = np.abs(self.cell_m[cells] - mean).max(axis=1).min() > self.width_m.max() / 2
+            if outside or not allowed(mean[None])[0]:
+                mean = self.xy_m[cells][height.argmax()]
             found.append((mean, float(weights[k])))
         return found
 
 
 def second_mode(modes: list[tuple[np.ndarray, float]]) -> tuple[float, float, float] | None:
-    """Return the heaviest mode that is separate from the first.
+    """Return the heaviest mode that is far enough from the first mode.
 
     Args:
         modes: positions (2,) [m] and weights, heaviest first.
 
     Returns:
-        (x_m, y_m, weight), at least MODE_SEPARATION_M away and MIN_MODE_WEIGHT heavy; None: no such
+        (x_m, y_m, weight), at least MODE_SEPARATION_M away and of MIN_MODE_WEIGHT; None: no such
         mode.
     """
     first = modes[0][0]
@@ -105,29 +105,20 @@ def second_mode(modes: list[tuple[np.ndarray, float]]) -> tuple[float, float, fl
     return None
 
 
-def refine(
-    log_likelihood: Callable[[np.ndarray], np.ndarray],
-    centre_m: np.ndarray,
-    point_m: np.ndarray,
-    value: np.ndarray,
-    width_m: float,
-    peaks_m: np.ndarray,
-    likelihood_power: float,
-) -> Posterior:
-    """Split the cells of a scan that matter until they are below FINEST_M, and weigh all.
+def refine(log_likelihood: Callable[[np.ndarray], np.ndarray], centre_m: np.ndarray,
+           point_m: np.ndarray, value: np.ndarray, width_m: float, peaks_m: np.ndarray,
+           likelihood_power: float) -> Posterior:
+    """Split the likeliest cells of a scan until they are below FINEST_M, and normalise all.
 
     Args:
-        log_likelihood: maps positions (p, 2) to (p,) [nats], -inf where a device may not be.
+        log_likelihood: function from positions (p, 2) [m] to (p,) [nats]; -inf: not allowed.
         centre_m: (c, 2) centres of the scan's cells [m].
         point_m: (c, 2) points at which they were evaluated [m].
-        value: (c,) log-likelihood there [nats].
-        width_m: of the scan's cells [m].
-        peaks_m: (s, 2) positions whose cells are split whatever their value, because a peak may be
-            narrower than a cell [m].
-        likelihood_power: of the likelihood, at most 1.
-
-    Returns:
-        posterior
+        value: (c,) log-likelihood at the points [nats].
+        width_m: width of the scan's cells [m].
+        peaks_m: (s, 2) positions whose cells are always split, because a peak may be narrower than
+            a cell [m].
+        likelihood_power: power of the likelihood for the posterior, at most 1.
     """
     cell_m = centre_m
     done = []
@@ -150,6 +141,6 @@ def refine(
         allowed = np.isfinite(value)
         centre_m, point_m = centre_m[allowed], point_m[allowed]
         cell_m, value = cell_m[allowed], value[allowed]
-    xy_m, cell_m, widths_m, value = (np.concatenate(each) for each in zip(*done, strict=True))
+    xy_m, cell_m, widths_m, value = (np.concatenate(parts) for parts in zip(*done, strict=True))
     mass = widths_m**2 * np.exp(likelihood_power * (value - value.max()))
     return Posterior(xy_m, cell_m, widths_m, value, mass / mass.sum())

@@ -1,9 +1,9 @@
-"""Devices of unknown position, by a channel with effects: for networks without a 3D map, too.
+"""Locate devices by a fitted model with effects, with or without a 3D map.
 
-The posterior over the ground of each device by itself: the likelihood of its links, with everything
-that was found of their receivers, and a level of the device's own that nobody knows (hand, pocket,
-battery), which is integrated out (Gauss-Hermite). The prior is flat over the area; a coarse grid
-first, then a finer one where the probability is.
+Each device has a posterior over the ground: the likelihood of its links, with the effects of their
+receivers. The device's own unknown level (hand, pocket, battery) is integrated out by Gauss-Hermite
+quadrature. The prior is uniform over the area. Cells are first coarse, then fine where the
+probability is.
 """
 
 from __future__ import annotations
@@ -15,16 +15,15 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from radiotwin.links import Links
-from radiotwin.twin.localize.estimate import TwinDevice
+from radiotwin.twin.localize.estimate import CREDIBLE, TwinDevice
 from radiotwin.twin.model.model import Fit, FittedModel
 
-COARSE_CELLS, MAX_FINE_CELLS, MAX_SPLIT = 1500, 640, 4
-HELD = 0.999  # of the probability, by the coarse cells that are split
-NODES = 7  # of the quadrature over the device's own level
-CREDIBLE = 0.9
-MIN_LINKS = 3
-MARGIN_M = 300.0  # of the area around all ends that are known
-LINKS_AT_ONCE = 400_000  # of all cells together: bounds memory, 260 bytes each without a map
+COARSE_CELLS, MAX_FINE_CELLS, MAX_SPLIT = 1500, 640, 4  # the last: fine cells along a coarse one
+HELD = 0.999  # probability of the coarse cells that are split
+NODES = 7  # quadrature nodes over the device's own level
+MIN_LINKS = 3  # links needed to locate a device
+MARGIN_M = 300.0  # of the area around all known positions
+LINKS_AT_ONCE = 400_000  # links in all cells predicted at a time: 260 bytes each without a map
 
 Area = tuple[float, float, float, float]
 """West, east, south and north end of where devices may be [m]."""
@@ -32,13 +31,13 @@ Area = tuple[float, float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class PositionPosterior:
-    """Likelihood of the links of one device over the cells where nearly all probability is.
+    """Log-likelihood of one device's links over the cells that hold nearly all probability.
 
     Attributes:
-        device: its name.
-        cells_m: (c, 2) their centres [m].
-        width_m: their width [m].
-        log_likelihood: (c,) of the links.
+        device: name of the device.
+        cells_m: (c, 2) centres of the cells [m].
+        width_m: width of the cells [m].
+        log_likelihood: (c,) log-likelihood of the device's links in each cell [nats].
         apart_m: (c, c) distance between cells [m].
         z_m: height of the device [m].
     """
@@ -51,19 +50,29 @@ class PositionPosterior:
     z_m: float
 
     @classmethod
-    def of(cls, model: FittedModel, own: Links, area_m: Area, power: float
+    def of(cls, model: FittedModel, device_links: Links, area_m: Area, power: float
            ) -> PositionPosterior:
-        """Return that of the links of one device; the cells hold the likelihood to a power."""
+        """Compute the log-likelihood over coarse cells, then over fine ones.
+
+        Args:
+            model: fitted model; counts receivers as the links do.
+            device_links: links of one device.
+            area_m: where the device may be.
+            power: power of the likelihood by which fine cells are chosen.
+        """
         coarse_m, width_m = _grid(area_m)
-        coarse = position_log_likelihood(model, own, coarse_m)
+        coarse = position_log_likelihood(model, device_links, coarse_m)
         cells_m, width_m = _finer(coarse, power, coarse_m, width_m)
-        device = int(own.device[0])
-        return cls(own.device_names[device], cells_m, width_m,
-                   position_log_likelihood(model, own, cells_m), cdist(cells_m, cells_m),
-                   float(own.device_m[device, 2]))
+        device = int(device_links.device[0])
+        return cls(device_links.device_names[device], cells_m, width_m,
+                   position_log_likelihood(model, device_links, cells_m), cdist(cells_m, cells_m),
+                   float(device_links.device_m[device, 2]))
 
     def estimate(self, power: float) -> TwinDevice:
-        """Return the position by the likelihood as it is, and the radius by its power."""
+        """Return the position of least expected distance, and the 90 % radius around it.
+
+        The radius is that of the likelihood raised to `power`, at most 1.
+        """
         best = int((self.apart_m @ _share(self.log_likelihood)).argmin())
         order = np.argsort(self.apart_m[best])
         cumulated = np.cumsum(_share(power * self.log_likelihood)[order])
@@ -75,51 +84,53 @@ class PositionPosterior:
 
 def locate(model: FittedModel, links: Links, area_m: Area,
            on_progress: Callable[[], None] = lambda: None) -> Iterator[TwinDevice]:
-    """Locate the devices of some links, whatever position the links have them at but for height.
+    """Locate each device of the links; only the heights of their device positions are used.
 
     Args:
-        model: counts receivers as `links` do.
-        links: of the devices.
-        area_m: where they may be.
+        model: fitted model; counts receivers as the links do.
+        links: links of the devices.
+        area_m: where the devices may be.
         on_progress: called after each device.
 
     Yields:
-        an estimate of each device with at least `MIN_LINKS` links.
+        position and radius of each device with at least `MIN_LINKS` links.
     """
     for device in np.unique(links.device):
-        own = links.select(links.device == device)
-        if len(own) >= MIN_LINKS:
+        device_links = links.select(links.device == device)
+        if len(device_links) >= MIN_LINKS:
             power = model.likelihood_power
-            found = PositionPosterior.of(model, own, area_m, power).estimate(power)
+            found = PositionPosterior.of(model, device_links, area_m, power).estimate(power)
             yield replace(found, credible_radius_m=model.radius_factor * found.credible_radius_m)
         on_progress()
 
 
 def whole_area(model: FittedModel, links: Links) -> Area:
-    """Return the area around all ends that are known."""
+    """Return the bounds of all receivers and known devices, plus MARGIN_M."""
     known = np.vstack([links.receiver_m[:, :2], model.device_m[:, :2]])
     (west, south), (east, north) = known.min(axis=0) - MARGIN_M, known.max(axis=0) + MARGIN_M
     return west, east, south, north
 
 
-def position_log_likelihood(model: FittedModel, own: Links,
+def position_log_likelihood(model: FittedModel, device_links: Links,
                             positions_m: np.ndarray) -> np.ndarray:
-    """Return the log-likelihood (c,) of the links of one device, if it were elsewhere.
+    """Return the log-likelihood (c,) of one device's links for candidate positions [nats].
 
     Args:
-        model: counts receivers as the links do.
-        own: links of one device.
-        positions_m: (c, 2) where it might be, at the height that the links have it [m].
+        model: fitted model; counts receivers as the links do.
+        device_links: links of one device.
+        positions_m: (c, 2) candidate positions, at the height of the device in the links [m].
     """
-    cells = max(LINKS_AT_ONCE // len(own), 1)
-    return np.concatenate([_log_likelihood_at(model, own, positions_m[first:first + cells])
-                           for first in range(0, len(positions_m), cells)])
+    cells = max(LINKS_AT_ONCE // len(device_links), 1)
+    return np.concatenate([
+        _log_likelihood_at(model, device_links, positions_m[first:first + cells])
+        for first in range(0, len(positions_m), cells)])
 
 
-def _log_likelihood_at(model: FittedModel, own: Links, positions_m: np.ndarray) -> np.ndarray:
-    """Return the same for few enough positions, all at once."""
-    n, cells, sd_db = len(own), len(positions_m), model.device_sd_db
-    fit = fit_elsewhere(model, own, positions_m)
+def _log_likelihood_at(model: FittedModel, device_links: Links, positions_m: np.ndarray
+                       ) -> np.ndarray:
+    """Compute a chunk of `position_log_likelihood`."""
+    n, cells, sd_db = len(device_links), len(positions_m), model.device_sd_db
+    fit = fit_elsewhere(model, device_links, positions_m)
     problem = fit.model.regression()
     nodes, weights = np.polynomial.hermite_e.hermegauss(NODES if sd_db > 0 else 1)
     values = []
@@ -129,43 +140,41 @@ def _log_likelihood_at(model: FittedModel, own: Links, positions_m: np.ndarray) 
     return np.logaddexp.reduce(values, axis=0)
 
 
-def fit_elsewhere(model: FittedModel, own: Links, positions_m: np.ndarray) -> Fit:
-    """Return a model on the links of one device, again for each position (c, 2) that it may have.
+def fit_elsewhere(model: FittedModel, device_links: Links, positions_m: np.ndarray) -> Fit:
+    """Apply a model to one device's links, repeated for each candidate position of the device.
 
     Args:
-        model: counts receivers as the links do.
-        own: n links of one device.
-        positions_m: where it might be, at the height that the links have it [m].
+        model: fitted model; counts receivers as the links do.
+        device_links: n links of one device.
+        positions_m: (c, 2) candidate positions, at the height of the device in the links [m].
 
     Returns:
-        of c * n links, positions slowest.
+        the model on c * n links, positions slowest.
     """
-    n, cells, known = len(own), len(positions_m), len(model.device_m)
-    height_m = np.full(cells, own.device_m[own.device[0], 2])
+    n, cells, known = len(device_links), len(positions_m), len(model.device_m)
+    height_m = np.full(cells, device_links.device_m[device_links.device[0], 2])
     candidates_m = np.column_stack([positions_m, height_m])
-    # Effects count devices as the model does, so the candidates come after those that it knows.
-    every = own.select(np.tile(np.arange(n), cells)).of_devices(
+    # Effects refer to devices by their rows in the model, so candidates are appended to these.
+    repeated = device_links.select(np.tile(np.arange(n), cells)).of_devices(
         known + np.repeat(np.arange(cells), n), np.vstack([model.device_m, candidates_m]),
         [f"device {i}" for i in range(known + cells)], frozenset()).with_first_time(model.first_s)
-    return model.on_links(every)
+    return model.on_links(repeated)
 
 
 def _finer(log_likelihood: np.ndarray, power: float, coarse_m: np.ndarray,
            width_m: float) -> tuple[np.ndarray, float]:
-    """Return centres (c, 2) of finer cells where nearly all probability is, and their width [m].
-
-    The fewer coarse cells (k,) hold it, the finer.
-    """
+    """Split coarse cells that hold nearly all probability; return centres (c, 2), width [m]."""
     share = _share(power * log_likelihood)
     order = np.argsort(-share)
     held = order[:int(np.searchsorted(np.cumsum(share[order]), HELD)) + 1]
-    times = int(np.clip(np.sqrt(MAX_FINE_CELLS / len(held)), 1, MAX_SPLIT))
-    steps_m = (np.arange(times) + 0.5) * width_m / times - width_m / 2
+    split = int(np.clip(np.sqrt(MAX_FINE_CELLS / len(held)), 1, MAX_SPLIT))
+    steps_m = (np.arange(split) + 0.5) * width_m / split - width_m / 2
     around_m = np.stack(np.meshgrid(steps_m, steps_m), axis=-1).reshape(-1, 2)
-    return (coarse_m[held, None] + around_m).reshape(-1, 2), width_m / times
+    return (coarse_m[held, None] + around_m).reshape(-1, 2), width_m / split
 
 
 def _share(log_likelihood: np.ndarray) -> np.ndarray:
+    """Normalise log-likelihoods (c,) [nats] to probabilities."""
     share = np.exp(log_likelihood - log_likelihood.max())
     return share / share.sum()
 

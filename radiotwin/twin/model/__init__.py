@@ -1,1 +1,1 @@
-"""The model of a level: channel, effects, and their fit."""
+"""Regression model of a link's level: channel, effects, and their fit."""

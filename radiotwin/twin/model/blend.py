@@ -1,8 +1,8 @@
-"""Interpolation and regression beside named effects, with weights that depend on the place.
+"""Blend: weighted mean of the fitted model, kriging and regression trees.
 
-Near measured places they know most, far from them physics does: each member has a weight near
-measurements and one far from them, found on held-out links by
-`radiotwin.closeloop.predict.weights`. Folds of a loop predict by the same class as twins.
+Near measurements, interpolation and trees predict best; far from them, physics does. So each member
+has a weight near measurements and one far from them, found on held-out links by
+`radiotwin.closeloop.predict.weights`. Folds of the loop predict by the same class as twins.
 """
 
 from __future__ import annotations
@@ -30,39 +30,44 @@ from radiotwin.propagation.laws.kriging import RegressionKriging
 from radiotwin.propagation.laws.log_distance import SegmentedLogDistance
 from radiotwin.twin.model.correlated_shadowing import moving_ends
 
-NAMED, REST = "named", "named_and_rest"
-FORESTS = ("named_and_trees", "named_and_boosting")  # members, learnt of what named effects leave
-LEVEL_FORESTS = ("trees_of_levels", "boosting_of_levels")  # members, learnt of the levels
-LAWS = {each.name: each for each in (SegmentedLogDistance, RegressionKriging)}
-MAX_SD_RATIO = 100.0
+NAMED, REST = "named", "named_and_rest"  # members: named effects, without and with shadowing
+FORESTS = ("named_and_trees", "named_and_boosting")  # members: trees of residuals of named effects
+LEVEL_FORESTS = ("trees_of_levels", "boosting_of_levels")  # members: trees of levels
+LAWS = {law.name: law for law in (SegmentedLogDistance, RegressionKriging)}
+MAX_SD_RATIO = 100.0  # largest in a file
 
 
 def far_share(away_m: np.ndarray, half_m: float) -> np.ndarray:
-    """Return how far places are from all measured ones, in 0..1: d / (d + half).
+    """Return the share (n,) of the far weights, d / (d + half).
 
     Args:
-        away_m: (n,) distance d to the nearest measurement [m]; inf = there is none.
-        half_m: distance at which near and far count the same [m].
+        away_m: (n,) distance d to the nearest measurement [m]; inf: no measurement.
+        half_m: distance of equal near and far shares [m].
     """
     return 1 - half_m / (away_m + half_m)
 
 
 def sd_factor(share: np.ndarray, sd_ratio: tuple[float, float]) -> np.ndarray:
-    """Return the ratio of standard deviations (n,) at `far_share` (n,), as of `Blend`."""
+    """Interpolate the factor (n,) on the error scale between near and far, see `Blend.sd_ratio`.
+
+    Args:
+        share: (n,) share of the far weights, see `far_share`.
+        sd_ratio: factor near measurements, and far from them.
+    """
     near, far = np.square(sd_ratio)
     return np.sqrt((1 - share) * near + share * far)
 
 
 def blended(members_db: np.ndarray, scales_db: np.ndarray, share: np.ndarray,
             weights: np.ndarray, sd_ratio: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and error scale (n,) of a combination [dB].
+    """Combine the predictions of members to one mean and error scale (n,) [dB].
 
     Args:
-        members_db: (n, k) levels by members [dB].
-        scales_db: (n, k) of their errors [dB].
-        share: (n,) of the far weights, see `far_share`.
-        weights: (2, k) near and far.
-        sd_ratio: as of `Blend`.
+        members_db: (n, k) level predicted by each member [dB].
+        scales_db: (n, k) error scale of each member [dB].
+        share: (n,) share of the far weights, see `far_share`.
+        weights: (2, k) weights near measurements, and far from them.
+        sd_ratio: see `Blend`.
     """
     scale_db = np.sqrt(combine(np.square(scales_db), share, weights))
     return combine(members_db, share, weights), scale_db * sd_factor(share, sd_ratio)
@@ -70,20 +75,19 @@ def blended(members_db: np.ndarray, scales_db: np.ndarray, share: np.ndarray,
 
 @dataclass(frozen=True, eq=False)
 class Blend:
-    """Members beside named effects, and the weights of all.
+    """Members that predict beside the named effects, and the weights of all members.
 
     Attributes:
-        weights: of each member, near measurements and far from them; both sum to one.
-        half_m: as of `far_share` [m].
-        sd_ratio: scale of the error over the root mean square of the members' scales, by weight,
-            near and far.
-        receivers_move: whether devices stand still and receivers move, or the other way round.
-        measured_m: (p, 3) positions of the end that moves [m], and
-        measured_other: (p,) the end that stands still and was measured with it there.
-        forests: by name, of the standardised residual of named effects (`FORESTS`), or of the
-            levels (`LEVEL_FORESTS`) [dB].
-        laws: fitted to the levels, by name.
-        boresights_deg: (j, 2) device, and its declared azimuth [deg]; forests know of these.
+        weights: weight of each member near measurements, and far from them; both sum to one.
+        half_m: distance from measurements of equal near and far weights [m].
+        sd_ratio: error scale over the weighted root mean square of the members' scales, near
+            measurements, and far from them.
+        receivers_move: True: receivers move and devices are fixed; False: the other way round.
+        measured_m: (p, 3) measured positions of the moving end [m].
+        measured_other: (p,) row of the fixed end in each of these measurements.
+        forests: trees by name: of standardised residuals (`FORESTS`), or levels (`LEVEL_FORESTS`).
+        laws: channel models fitted to the levels, by name.
+        boresights_deg: (j, 2) device row and its declared azimuth [deg], a feature of the trees.
     """
 
     weights: dict[str, tuple[float, float]]
@@ -97,31 +101,28 @@ class Blend:
     boresights_deg: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
 
     def away_m(self, links: Links) -> np.ndarray:
-        """Return how far the moving ends of links are from where they were measured (n,) [m].
+        """Return the distance (n,) of the moving end to its nearest measured position [m].
 
-        With the same other end; inf where it was not measured at all.
+        Only measurements with the same fixed end count; inf if there are none.
         """
         moving_m, other = moving_ends(links, self.receivers_move)
         away_m = np.full(len(links), np.inf)
         for label in np.unique(other):
-            known_m, own = self.measured_m[self.measured_other == label], other == label
+            known_m, rows = self.measured_m[self.measured_other == label], other == label
             if len(known_m):
-                away_m[own] = cKDTree(known_m).query(moving_m[own])[0]
+                away_m[rows] = cKDTree(known_m).query(moving_m[rows])[0]
         return away_m
 
     def members_db(self, links: Links, mean_db: np.ndarray, scale_db: np.ndarray, dof: float,
                    rest: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Return level and error scale (n, k) of each member, in the order of the weights [dB].
-
-        Kriging is surer near measurements than far from them; trees do not tell.
+        """Return level (n, k) and error scale (n, k) of each member, in the order of weights [dB].
 
         Args:
             links: n links.
-            mean_db: (n,) by named effects [dB].
-            scale_db: (n,) of their errors [dB].
+            mean_db: (n,) level predicted by named effects [dB].
+            scale_db: (n,) error scale of named effects, also used for trees [dB].
             dof: degrees of freedom of the errors.
-            rest: (n,) what is interpolated [error scales], 0 without it; and (n,) the share that it
-                leaves of the scale.
+            rest: (n,) interpolated residual [error scales], and (n,) remaining share of the scale.
         """
         members = {NAMED: mean_db, REST: mean_db + rest[0] * scale_db}
         scales = dict.fromkeys(self.weights, scale_db) | {REST: rest[1] * scale_db}
@@ -140,9 +141,9 @@ class Blend:
 
     def apply(self, links: Links, mean_db: np.ndarray, scale_db: np.ndarray, dof: float,
               rest: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and error scale (n,) of the combination [dB], before any limit of detection.
+        """Return mean and error scale (n,) of the weighted members [dB]; arguments of `members_db`.
 
-        Arguments as of `members_db`.
+        The limit of detection is ignored.
         """
         share = far_share(self.away_m(links), self.half_m)
         return blended(*self.members_db(links, mean_db, scale_db, dof, rest), share,
@@ -150,14 +151,14 @@ class Blend:
 
     def weighted(self, weights: dict[str, tuple[float, float]], half_m: float,
                  sd_ratio: tuple[float, float]) -> Blend:
-        """Return the members that have a weight, with it."""
+        """Set the weights, and drop members without a weight; see the class."""
         return replace(self, weights=weights, half_m=half_m, sd_ratio=sd_ratio,
-                       forests={name: each for name, each in self.forests.items()
+                       forests={name: forest for name, forest in self.forests.items()
                                 if name in weights},
-                       laws={name: each for name, each in self.laws.items() if name in weights})
+                       laws={name: law for name, law in self.laws.items() if name in weights})
 
     def _declared(self, links: Links) -> Links:
-        """Return links with the azimuths that were declared where this was fitted, no others."""
+        """Return links with the antenna azimuths that were declared at the fit."""
         boresight_deg = np.full(len(links.device_names), np.nan)
         boresight_deg[self.boresights_deg[:, 0].astype(int)] = self.boresights_deg[:, 1]
         return links.with_ends(boresight_deg=boresight_deg)
@@ -169,52 +170,52 @@ class Blend:
         if len(self.boresights_deg):
             arrays["boresights_deg"] = self.boresights_deg
         settings: dict[str, Any] = {
-            "weights": {name: list(each) for name, each in self.weights.items()},
+            "weights": {name: list(pair) for name, pair in self.weights.items()},
             "half_m": self.half_m, "sd_ratio": list(self.sd_ratio),
             "receivers_move": self.receivers_move, "models": {}}
         models: dict[str, Forest | ChannelModel] = {**self.forests, **self.laws}
         for name, model in models.items():
-            own, settings["models"][name] = model.state()
-            arrays |= {f"{name}/{each}": array for each, array in own.items()}
+            of_model, settings["models"][name] = model.state()
+            arrays |= {f"{name}/{part}": array for part, array in of_model.items()}
         return arrays, settings
 
     @classmethod
     def from_state(cls, arrays: dict[str, np.ndarray], settings: dict[str, Any],
                    devices: int) -> Self:
-        """Return what `state` described.
+        """Restore a blend from its `state`, after checking it.
 
         Args:
-            arrays: of `state`.
-            settings: of `state`.
-            devices: of the twin.
+            arrays: arrays of `state`.
+            settings: settings of `state`.
+            devices: number of devices of the twin.
 
         Raises:
             BadInput: too large.
-            ValueError: it is damaged.
+            ValueError: damaged.
             KeyError: a part is missing.
         """
         require_names("settings", settings, ["weights", "half_m", "sd_ratio", "receivers_move",
                                               "models"])
         forests: dict[str, Forest] = {}
         laws: dict[str, ChannelModel] = {}
-        own = {"measured_m", "measured_other"} | (arrays.keys() & {"boresights_deg"})
+        expected = {"measured_m", "measured_other"} | (arrays.keys() & {"boresights_deg"})
         boresights_deg = np.zeros((0, 2))
-        if "boresights_deg" in own:
+        if "boresights_deg" in expected:
             boresights_deg = require_array(arrays, "boresights_deg", (None, 2), -MAX_ANGLE_DEG,
                                            max(MAX_ANGLE_DEG, devices - 1))
             if not np.isin(boresights_deg[:, 0], np.arange(devices)).all():
                 raise ValueError("an azimuth belongs to no device")
         width = feature_count(devices, len(boresights_deg) > 0)
         for name, given in settings["models"].items():
-            parts = {each.removeprefix(f"{name}/"): array for each, array in arrays.items()
-                     if each.startswith(f"{name}/")}
-            own |= {f"{name}/{each}" for each in parts}
+            parts = {key.removeprefix(f"{name}/"): array for key, array in arrays.items()
+                     if key.startswith(f"{name}/")}
+            expected |= {f"{name}/{part}" for part in parts}
             if name in FORESTS + LEVEL_FORESTS:
                 forests[name] = Forest.from_state(parts, given, width)
             else:
                 laws[name] = LAWS[name].from_state(
-                    {each: array.copy() for each, array in parts.items()}, given)
-        require_names("arrays", arrays, own)
+                    {part: array.copy() for part, array in parts.items()}, given)
+        require_names("arrays", arrays, expected)
         weights = {name: (require_number({name: near}, name, 0, 1),
                           require_number({name: far}, name, 0, 1))
                    for name, (near, far) in settings["weights"].items()}

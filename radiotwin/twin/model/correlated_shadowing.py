@@ -1,11 +1,10 @@
-"""`correlated_shadowing`, the last resort: an interpolation of what no named effect explains.
+"""`correlated_shadowing`: interpolate the residuals that no named effect explains.
 
-A Gaussian process over the position of the end that moves, one field for each of the ends that do
-not (the exponential model of shadowing, Gudmundson 1991, Electronics Letters 27), and beside it an
-error of each receiver in each field. What was measured of a device's relatives, on the same mast,
-comes first: sectors of one mast look over the same city. It has no physical cause: it says that the
-rest of the error has a position. It is no candidate among the effects, because it would fit part of
-whatever they stand for.
+A Gaussian process over the position of the moving end, one field for each fixed end (exponential
+model of shadowing, Gudmundson 1991, Electronics Letters 27), plus an error of each receiver in each
+field. Before it, residuals of a device's relatives on the same mast predict part of the device's
+residual: sectors of one mast look over the same city. It has no physical cause, and is not among
+the candidate effects, because it would absorb part of any effect.
 """
 
 from __future__ import annotations
@@ -21,15 +20,15 @@ from radiotwin.links.sites import antenna_of, relatives_of
 from radiotwin.propagation.laws.kriging import MIN_POINTS, ResidualField
 from radiotwin.runtime.pieces import kept
 
-MIN_SD = 1e-6  # of a residual that is nothing
-LEAST_SHARED_SD = 0.1  # of what relatives say, in error scales: less is nearly nothing
-PAIRS = 9e6  # of their points, see `ResidualField`: a quarter of those of the devices themselves
+MIN_SD = 1e-6  # least standard deviation of residuals, against division by zero
+LEAST_SHARED_SD = 0.1  # prior sd of relatives' residuals [error scales], shrinks their slope
+PAIRS = 9e6  # `max_pairs` of the field of relatives: a quarter of that of the devices
 NAME = "correlated_shadowing"
-MAX_Z = 6.0  # an outlier counts as this many scales
+MAX_Z = 6.0  # residuals are clipped to so many error scales
 
 
 class FieldState(BaseModel):
-    """An interpolated residual in a file; arrays are checked by the field."""
+    """A residual field in a file; the field itself checks the arrays."""
 
     model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
 
@@ -39,7 +38,7 @@ class FieldState(BaseModel):
 
     @property
     def field(self) -> ResidualField:
-        """The field that `written_field` wrote."""
+        """Restore the field that `written_field` wrote."""
         arrays = {name: np.array(array, dtype=float) for name, array in self.arrays.items()}
         return ResidualField.from_state(arrays, self.settings)
 
@@ -51,13 +50,13 @@ class RelativesState(FieldState):
 
 
 def _fitted_field(what: str, field: ResidualField, *points: Any) -> ResidualField:
-    """Return an empty field after its fit to points (`ResidualField.fit`), or one that was kept."""
+    """Fit an empty field to points (`ResidualField.fit`), or load the result of an earlier run."""
     return kept(what, points, lambda: field.fit(*points), ResidualField.state,
                 ResidualField.from_state)
 
 
 def written_field(field: ResidualField) -> dict[str, Any]:
-    """Return what `FieldState` reads, without the standard deviation; positions to a decimetre."""
+    """Return settings and arrays of a field for `FieldState`; positions to a decimetre."""
     arrays, settings = field.state()
     return {"settings": settings,
             "arrays": {name: array.round(1 if name.startswith("position") else 4).tolist()
@@ -66,14 +65,15 @@ def written_field(field: ResidualField) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class Relatives:
-    """Prediction of devices by their relatives, see `radiotwin.links.sites.relatives_of`.
+    """Prediction of a device's residuals from those of its relatives on the same mast.
+
+    See `radiotwin.links.sites.relatives_of`.
 
     Attributes:
-        field: for each device of the residual of its relatives, never its own, in units of its
-            standard deviation.
-        relative_sd: that standard deviation, in units of the error scale.
-        passed_on: device -> share of it that is the device's, too, in 0..1; one for all whose
-            relatives are of their antenna, one for the others.
+        field: field of the relatives' standardised residuals, one series for each device.
+        relative_sd: standard deviation of the relatives' residuals [error scales].
+        passed_on: device -> share of the relatives' residual that it has, too, in 0..1; one share
+            for devices with relatives of the same antenna, one for the others.
     """
 
     field: ResidualField
@@ -83,22 +83,22 @@ class Relatives:
     @classmethod
     def fit(cls, links: Links, z: np.ndarray, field: ResidualField | None,
             seed: int) -> Relatives | None:
-        """Return what links with residuals (n,) say of their relatives; None if none has any.
+        """Fit the field of relatives' residuals, and the shares; None if no device has relatives.
 
         Args:
-            links: n links, of which receivers move.
+            links: n links with moving receivers.
             z: (n,) residuals [error scales].
-            field: whose correlation is taken; None: it is fitted.
-            seed: of that.
+            field: field whose correlation is used; None: it is fitted.
+            seed: of random subsets of points.
         """
         heard = set(np.unique(links.device).tolist())
         devices = [(device, np.flatnonzero(np.isin(links.device, relatives)))
                    for device in sorted(links.anchors)
                    for relatives in [relatives_of(links, device, heard)] if relatives]
-        rows = np.concatenate([np.zeros(0, dtype=int), *(each for _, each in devices)])
+        rows = np.concatenate([np.zeros(0, dtype=int), *(rows for _, rows in devices)])
         if len(rows) < MIN_POINTS:
             return None
-        series = np.concatenate([np.full(len(each), device) for device, each in devices])
+        series = np.concatenate([np.full(len(rows), device) for device, rows in devices])
         relative_sd = max(float(z[rows].std()), MIN_SD)
         points = series, links.receiver_m[rows], (z[rows] - z[rows].mean()) / relative_sd
         kind = links.receiver[rows]
@@ -110,40 +110,41 @@ class Relatives:
         near = [device for device in field.fields
                 if set(antenna_of(links, device)) & (heard - {device})]
         passed_on: dict[int, float] = {}
-        for alike in (near, sorted(set(field.fields) - set(near))):
-            mine = np.isin(links.device, alike)
-            # Where none of the kind was heard itself, as much as of all.
-            share = _slope(mean[mine], z[mine]) if mine.any() else _slope(mean, z)
-            passed_on |= dict.fromkeys(alike, share)
+        for group in (near, sorted(set(field.fields) - set(near))):
+            group_links = np.isin(links.device, group)
+            # If no device of the group was heard itself, use the slope of all links.
+            share = _slope(mean[group_links], z[group_links]) if group_links.any() \
+                else _slope(mean, z)
+            passed_on |= dict.fromkeys(group, share)
         return cls(field, relative_sd, passed_on)
 
     def mean(self, links: Links) -> np.ndarray:
-        """Return what they say of links (n,) [error scales]; 0 where they say nothing."""
+        """Predict residuals (n,) of links from relatives [error scales]; 0 without relatives."""
         return self._share(links) * self.relative_sd * self.field.mean(
             links.device, links.receiver_m, links.receiver)
 
     def at(self, links: Links) -> tuple[np.ndarray, np.ndarray]:
-        """Return `mean`, and the share (n,) left of the error scale."""
+        """Return `mean`, and the remaining share (n,) of the error scale."""
         mean, sd = self.field.predict(links.device, links.receiver_m, links.receiver)
         share = self._share(links)
         return share * self.relative_sd * mean, np.sqrt(1 - share**2 * (1 - sd**2))
 
     def _share(self, links: Links) -> np.ndarray:
-        """Return `passed_on` of the device of each link (n,); 0 of one without relatives."""
+        """Return `passed_on` of each link's device (n,); 0 without relatives."""
         share = np.zeros(len(links))
         for device, passed_on in self.passed_on.items():
             share[links.device == device] = passed_on
         return share
 
     def state(self) -> dict[str, Any]:
-        """Return what JSON can hold and `of` reads."""
+        """Return shares, settings and arrays for JSON, which `of` reads."""
         passed_on = [self.passed_on[device] for device in self.field.fields]
         return {"relative_sd": self.relative_sd, "passed_on": passed_on,
                 **written_field(self.field)}
 
     @classmethod
     def of(cls, record: RelativesState) -> Relatives:
-        """Return what `state` described; raise ValueError where it is damaged."""
+        """Restore the prediction from its `state`; raise ValueError if it is damaged."""
         field = record.field
         if len(record.passed_on) != len(field.fields):
             raise ValueError("passed_on is not of the devices")
@@ -152,6 +153,7 @@ class Relatives:
 
 
 def _slope(mean: np.ndarray, z: np.ndarray) -> float:
+    """Regress residuals (n,) on relatives' residuals (n,), with shrinkage; clip to 0..1."""
     slope = float(mean @ z / (mean @ mean + len(z) * LEAST_SHARED_SD**2))
     return min(max(slope, 0.0), 1.0)
 
@@ -166,14 +168,14 @@ class _State(FieldState):
 
 @dataclass(frozen=True, eq=False)
 class CorrelatedShadowing:
-    """A field of the residual for each end that does not move.
+    """Interpolated residuals: one field for each fixed end, plus the prediction by relatives.
 
     Attributes:
-        field: of the residual, without what relatives say, in units of its own standard deviation.
-        relative_sd: that standard deviation, in units of the error scale.
-        receivers_move: whether devices stand still and receivers move, or the other way round.
-        certain: whether it lowers the error scale where it was measured.
-        relatives: what relatives say; None: nobody has any.
+        field: field of the standardised residuals, after subtracting the relatives' prediction.
+        relative_sd: standard deviation of these residuals [error scales].
+        receivers_move: True: receivers move and devices are fixed; False: the other way round.
+        certain: True if the error scale is smaller near measurements.
+        relatives: prediction by relatives; None: no device has relatives.
     """
 
     field: ResidualField
@@ -185,14 +187,14 @@ class CorrelatedShadowing:
     @classmethod
     def fit(cls, links: Links, train: np.ndarray, z: np.ndarray, seed: int,
             like: CorrelatedShadowing | None = None) -> CorrelatedShadowing:
-        """Learn what a channel and effects leave over of links, see `Fit.rest`.
+        """Fit the interpolation to residuals of a model, see `Fit.rest`.
 
         Args:
             links: n links.
-            train: (n,) bool, m links that are learnt from.
-            z: (m,) their residuals [error scales].
-            seed: of the samples that correlations are fitted to.
-            like: another one, whose correlations are taken; None: they are fitted.
+            train: (n,) bool, the m training links.
+            z: (m,) residuals of the training links [error scales].
+            seed: of random subsets of points.
+            like: shadowing whose correlations are used; None: they are fitted.
         """
         move = like.receivers_move if like else receivers_move(links)
         links, relatives = links.select(train), None
@@ -209,16 +211,16 @@ class CorrelatedShadowing:
         return cls(field, relative_sd, move, like is None or like.certain, relatives)
 
     def at(self, links: Links) -> tuple[np.ndarray, np.ndarray]:
-        """Return what it adds (n,) [error scales], and the share (n,) left of the error scale."""
+        """Return interpolated residual (n,) [error scales], remaining share (n,) of the scale."""
         mean, sd = self.field.predict(*_points(links, self.receivers_move))
         mean = self.relative_sd * mean
         if self.relatives is not None:
-            said, left = self.relatives.at(links)
-            mean, sd = mean + said, sd * left
+            by_relatives, remaining = self.relatives.at(links)
+            mean, sd = mean + by_relatives, sd * remaining
         return mean, sd if self.certain else np.ones_like(sd)
 
     def state(self) -> dict[str, Any]:
-        """Return what JSON can hold and `from_state` reads; positions to the decimetre."""
+        """Return settings and arrays for JSON, which `from_state` reads."""
         state = {"relative_sd": self.relative_sd, "receivers_move": self.receivers_move,
                  "certain": self.certain, **written_field(self.field)}
         if self.relatives is not None:
@@ -227,10 +229,10 @@ class CorrelatedShadowing:
 
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> CorrelatedShadowing:
-        """Return what `state` described.
+        """Restore the interpolation from its `state`.
 
         Raises:
-            ValueError: it is damaged.
+            ValueError: damaged.
             KeyError: a part is missing.
         """
         record = _State.model_validate(state)
@@ -241,21 +243,21 @@ class CorrelatedShadowing:
 
 def _points(links: Links,
             receivers_move: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Return series, position and kind of links.
+    """Return series (n,), position (n, 3) [m] and kind (n,) of links for a `ResidualField`.
 
-    Where two receivers were at one position, their difference shows.
+    The kind is the receiver if receivers move, so that each receiver has an error of its own.
     """
     position_m, series = moving_ends(links, receivers_move)
     return series, position_m, links.receiver if receivers_move else None
 
 
 def moving_ends(links: Links, receivers_move: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions (n, 3) of the end that moves [m], and the row (n,) of the other end."""
+    """Return positions (n, 3) of the moving end [m], and rows (n,) of the fixed end."""
     if receivers_move:
         return links.receiver_m, links.device
     return links.device_m[links.device], links.receiver
 
 
 def receivers_move(links: Links) -> bool:
-    """Return whether receivers have been at more positions than there are devices."""
+    """Return True if receivers were at least at as many positions as there are devices."""
     return len(np.unique(links.receiver_m[:, :2].round(), axis=0)) >= len(links.device_names)

@@ -1,4 +1,4 @@
-"""Finding the parameters of one more effect: proposals, a search over its numbers, exact levels."""
+"""Fit one more effect to a model: proposals, search over its parameters, exact path levels."""
 
 from __future__ import annotations
 
@@ -24,31 +24,34 @@ from radiotwin.runtime.pieces import KeptParts, Piece, keeps, kept
 from radiotwin.runtime.processes import resident_bytes
 from radiotwin.twin.model.model import Fit, Model, response
 
-EVALUATIONS = 25  # of the objective for each number, in one descent
-DESCENTS = 2  # a simplex that has collapsed too early starts anew; one for a fold, which is near
-MAX_LINKS, MAX_LINKS_OF_MEMBER = 5000, 1500  # that numbers are refined on
+EVALUATIONS = 25  # evaluations of the objective for each parameter, in one descent
+DESCENTS = 2  # restarts of a simplex that may have collapsed; a fold, which starts near, has one
+MAX_LINKS, MAX_LINKS_OF_MEMBER = 5000, 1500  # links on which parameters are refined
 OUTSIDE_NATS = 10.0  # penalty of a step outside the bounds
-EXTREMES_DB = (-200.0, 100.0)  # levels at which whatever a receiver does to them shows
-EXACT_EVALUATIONS, MAX_EXACT_LINKS = 8, 1500  # of `refine`, where each value follows paths
-MAX_FOLLOWED_LINKS = 5000  # that an effect changes: to follow paths of more takes many minutes
-MIN_EXACT_GAIN_NATS = 10.0  # that exact levels must gain to be refined on, and each descent
-MAX_EXACT_NUMBERS = 3  # of an effect whose paths are followed whatever its quick levels say
+EXTREMES_DB = (-200.0, 100.0)  # levels at which any receiver response is visible
+EXACT_EVALUATIONS, MAX_EXACT_LINKS = 8, 1500  # the same two for exact levels, which trace paths
+MAX_FOLLOWED_LINKS = 5000  # most links that an effect may change: tracing more takes many minutes
+MIN_EXACT_GAIN_NATS = 10.0  # likelihood that exact levels, and each descent, must gain to go on
+MAX_EXACT_NUMBERS = 3  # most parameters searched with exact levels if quick levels fit better
 MAX_EXACT_DESCENTS = 3  # the objective is rough, as paths open and close: a simplex stops early
-MAX_PROPOSALS = 4  # of one effect that are fitted
-MIN_GAIN_NATS = 5.0  # that a proposal must gain to be refined
-WORKER_BYTES = 2 * 2**30  # of a process that fits effects, at least
+MAX_PROPOSALS = 4  # proposals of one effect that are fitted
+MIN_GAIN_NATS = 5.0  # likelihood that a proposal must gain to be refined
+WORKER_BYTES = 2 * 2**30  # least memory of a process that fits effects
 
 
 def refine(fit: Fit, evaluations: int = EVALUATIONS, descents: int = DESCENTS,
            max_links: int = MAX_LINKS, anywhere: bool = False) -> Fit:
-    """Vary the last effect's parameters for a better fit to the training links.
+    """Search better parameters of the last effect by descents on the training links' likelihood.
 
     Args:
-        fit: of the model.
-        evaluations: of the objective for each number, in one descent.
-        descents: one after the other.
-        max_links: that the objective is of.
-        anywhere: whether the search also begins at `Variation.starts`.
+        fit: fit with the effect.
+        evaluations: evaluations of the objective for each parameter, in one descent.
+        descents: number of descents, one after the other.
+        max_links: most links in the objective.
+        anywhere: also start at `Variation.starts`.
+
+    Returns:
+        the better fit, or the given one.
     """
     model, last = fit.model, fit.effects[-1]
     variation = last.variation()
@@ -63,9 +66,9 @@ def refine(fit: Fit, evaluations: int = EVALUATIONS, descents: int = DESCENTS,
         return fit
     design_effect = fit.view.design_effect * len(rows) / max(train.sum(), 1)
     small = model.with_effects(model.effects[:-1]).restrict(rows)
-    rest = small.regression()
-    # What has no coefficients of its own moves those of the others little: they stay meanwhile.
-    alone = last.stage == "gain" and not len(model.terms[-1].prior_sd_db)
+    without = small.regression()
+    # An effect without coefficients hardly changes those of the others: keep them in the search.
+    keep_coefficients = last.stage == "gain" and not len(model.terms[-1].prior_sd_db)
     latest = fit
 
     def objective(numbers: np.ndarray) -> float:
@@ -73,8 +76,8 @@ def refine(fit: Fit, evaluations: int = EVALUATIONS, descents: int = DESCENTS,
         inside = np.clip(numbers, variation.low, variation.high)
         effect = variation.effect(inside)
         tried = small.with_effects([*small.effects, effect])
-        if alone:
-            moved = replace(rest, gain_db=rest.gain_db + tried.terms[-1].offset_db)
+        if keep_coefficients:
+            moved = replace(without, gain_db=without.gain_db + tried.terms[-1].offset_db)
             misfit = moved.nll(fit).sum()
         else:
             latest = tried.fit(latest)
@@ -93,9 +96,9 @@ def refine(fit: Fit, evaluations: int = EVALUATIONS, descents: int = DESCENTS,
 
 
 def _refine_members(fit: Fit, last: Effect, variation: Variation) -> Fit:
-    """Vary the numbers of each member by themselves, on the links that they act on.
+    """Search the parameters of each member of an effect separately, on the links that it changes.
 
-    Only a level of its own is fitted beside them.
+    Members are, for example, single devices. Only a common level is fitted with them.
     """
     model, numbers = fit.model, variation.values.copy()
     arriving_db = model.regression().arriving(fit.coefficients)[0] - model.terms[-1].offset_db
@@ -113,36 +116,36 @@ def _refine_members(fit: Fit, last: Effect, variation: Variation) -> Fit:
         return sum((through(np.full(len(links), level_db))[0] for level_db in EXTREMES_DB),
                    start=np.zeros(len(links)))
 
-    every = np.flatnonzero(model.train)
-    trained = model.links.select(every)
+    train_rows = np.flatnonzero(model.train)
+    trained = model.links.select(train_rows)
     for member in variation.members or ():
         moved, step = numbers.copy(), variation.steps[member]
         moved[member] += np.where(numbers[member] + step > variation.high[member], -step, step)
         acts = acted_db(trained, moved) != acted_db(trained, numbers)
-        rows = subsample(every[acts], MAX_LINKS_OF_MEMBER)
+        rows = subsample(train_rows[acts], MAX_LINKS_OF_MEMBER)
         if not len(rows):
             continue
         latest = None
         links = model.links.select(rows)
-        others = [(each, None if term.inputs is None else term.inputs[rows])
-                  for each, term in zip(model.effects[:-1], model.terms, strict=False)
-                  if each.stage == "receiver"]
-        alone = replace(model.with_effects([]).regression(rows),
-                        law_columns=np.ones((len(rows), 1)),
-                        prior_sd_db=np.full(1, ANY_LEVEL_SD_DB))
+        others = [(effect, None if term.inputs is None else term.inputs[rows])
+                  for effect, term in zip(model.effects[:-1], model.terms, strict=False)
+                  if effect.stage == "receiver"]
+        level_only = replace(model.with_effects([]).regression(rows),
+                             law_columns=np.ones((len(rows), 1)),
+                             prior_sd_db=np.full(1, ANY_LEVEL_SD_DB))
 
         def objective(values: np.ndarray, member: np.ndarray = member, rows: np.ndarray = rows,
                       links: Links = links, others: list[tuple[Effect, Any]] = others,
-                      alone: censored_regression.CensoredRegression = alone) -> float:
+                      level_only: censored_regression.CensoredRegression = level_only) -> float:
             nonlocal latest
             tried = numbers.copy()
             tried[member] = np.clip(values, variation.low[member], variation.high[member])
             effect, term = changed(links, tried)
-            own = [(effect, term.inputs)] if effect.stage == "receiver" else []
+            varied = [(effect, term.inputs)] if effect.stage == "receiver" else []
             outside = np.abs((values - tried[member]) / variation.steps[member]).sum()
             latest = censored_regression.fit(
-                replace(alone, law_db=arriving_db[rows] + term.offset_db,
-                        receiver=response([*others, *own])), latest)
+                replace(level_only, law_db=arriving_db[rows] + term.offset_db,
+                        receiver=response([*others, *varied])), latest)
             return latest.objective + OUTSIDE_NATS * outside
 
         numbers[member] = _descend(objective, numbers[member], variation.steps[member])
@@ -151,7 +154,7 @@ def _refine_members(fit: Fit, last: Effect, variation: Variation) -> Fit:
 
 def _descend(objective: Callable[[np.ndarray], float], values: np.ndarray, steps: np.ndarray,
              evaluations: int = EVALUATIONS) -> np.ndarray:
-    """Minimise by Brent's method, or that of Nelder and Mead (1965) for more than one number."""
+    """Minimise an objective by Brent's method, or Nelder and Mead (1965) for several parameters."""
     if len(values) == 1:
         around = (values[0] - steps[0], values[0] + steps[0])
         return minimize_scalar(lambda value: objective(np.array([value])), around, method="brent",
@@ -165,29 +168,29 @@ def _descend(objective: Callable[[np.ndarray], float], values: np.ndarray, steps
 
 
 def _better(fit: Fit, last: Effect, variation: Variation, numbers: np.ndarray) -> Fit:
-    """Return the fit with the last effect's numbers changed, where that is better."""
+    """Fit with new parameters of the last effect; return the given fit if that is not better."""
     effect = variation.effect(np.clip(numbers, variation.low, variation.high))
     better = fit.with_effect_at(-1, effect)
-    prior = last.neg_log_prior() - effect.neg_log_prior()
-    gain = fit.objective - better.objective + fit.view.design_effect * prior
-    return better if gain > 0 else fit
+    prior_nats = last.neg_log_prior() - effect.neg_log_prior()
+    gain_nats = fit.objective - better.objective + fit.view.design_effect * prior_nats
+    return better if gain_nats > 0 else fit
 
 
 def add_effect(fit: Fit, effect: Effect, like: Effect | None = None,
                group: np.ndarray | None = None) -> Fit | None:
-    """Find the best parameters of an effect on the training links, beside the effects there are.
+    """Add an effect to a fitted model, with the parameters of greatest likelihood.
 
-    On all links with quick levels, which `along_paths` replaces; on those of a fold with exact ones
-    where `like` has them.
+    On all links, levels are quick, and `along_paths` makes them exact; in a fold they are exact if
+    those of `like` are.
 
     Args:
-        fit: without it.
-        effect: what is added.
-        like: what was found of it on all links, where the fit is of a fold.
-        group: (m,) bool, training links that it is to explain, see `ResidualView.of_group`.
+        fit: fit without the effect.
+        effect: effect to add.
+        like: the effect as fitted to all links, if `fit` is of a fold; None: not a fold.
+        group: (m,) bool, training links that it should explain, see `ResidualView.of_group`.
 
     Returns:
-        the fit with the effect; None where nothing in the residual looks like the effect.
+        the fit with the effect; None if the effect proposes no parameters for these residuals.
     """
     inputs = (fit, effect, like) if group is None else (fit, effect, like, group)
     return kept("effect", inputs, lambda: _best_addition(fit, effect, like, group),
@@ -195,19 +198,19 @@ def add_effect(fit: Fit, effect: Effect, like: Effect | None = None,
 
 
 def along_paths(fit: Fit, without: Fit) -> Fit:
-    """Search on for the parameters of the last effect with levels of the channel's own paths.
+    """Refine the last effect with exact levels along the channel's paths.
 
     Args:
-        fit: that `add_effect` found.
+        fit: result of `add_effect`.
         without: the fit without the last effect.
 
     Returns:
-        the fit with exact levels in its last effect where these are better; what was given where
-        they are not, or may not be asked for (`Effect.always_exact`).
+        the fit with exact levels in its last effect; the given fit if these are not better, or the
+        effect does not use them (`Effect.always_exact`).
     """
-    effect, gain = fit.effects[-1], without.objective - fit.objective
+    effect, gain_nats = fit.effects[-1], without.objective - fit.objective
     changes_few = np.count_nonzero(fit.model.terms[-1].offset_db) <= MAX_FOLLOWED_LINKS
-    if not effect.always_exact or gain < MIN_GAIN_NATS or not changes_few:
+    if not effect.always_exact or gain_nats < MIN_GAIN_NATS or not changes_few:
         return fit
     found = kept("effect-along-paths", (fit, without), lambda: _best_along_paths(fit, without),
                  _write_addition, _reader(fit.model.with_effects(fit.effects[:-1]), effect))
@@ -216,16 +219,16 @@ def along_paths(fit: Fit, without: Fit) -> Fit:
 
 def prepare_additions(without: Sequence[Fit], effects: Sequence[Effect], executor: Executor,
                       like: Effect | None = None) -> None:
-    """Compute what `add_effect` will be asked, on the workers of an executor.
+    """Run `add_effect` for all pairs of fits and effects ahead of time, on an executor's workers.
 
-    The results are among the finished parts (`radiotwin.runtime.pieces`), from where `add_effect`
-    has them, equal to the bit. Where no parts are kept, nothing is done.
+    The results are cached (`radiotwin.runtime.pieces`), where `add_effect` finds them, equal to the
+    bit. Without a cache, nothing is done.
 
     Args:
-        without: k fits, to each of which the effects are added.
-        effects: one at a time.
-        executor: where it runs.
-        like: as of `add_effect`.
+        without: fits without the effects.
+        effects: effects, each added by itself.
+        executor: runs the workers.
+        like: see `add_effect`.
     """
     if not executor.is_worth_it or not keeps():
         return
@@ -234,7 +237,7 @@ def prepare_additions(without: Sequence[Fit], effects: Sequence[Effect], executo
         "effect", lambda piece: (without[piece[0]], effects[piece[1]], like),
         lambda found: found, lambda arrays, content: (arrays, content))
     function = partial(_added, list(without), list(effects), like)
-    # A worker holds links, map and models as this process does, and no more.
+    # A worker holds the same links, map and models as this process.
     memory_bytes = max(WORKER_BYTES, resident_bytes(os.getpid()))
     job: Job[tuple[int, int], Piece | None] = Job("fitting effects", function,
                                                   Resources(memory_bytes, False))
@@ -243,24 +246,24 @@ def prepare_additions(without: Sequence[Fit], effects: Sequence[Effect], executo
 
 def _added(without: list[Fit], effects: list[Effect], like: Effect | None,
            piece: tuple[int, int]) -> Piece | None:
-    """Add an effect to a fit, by the number of each."""
+    """Add effect `piece[1]` to fit `piece[0]`, and encode the result for the cache."""
     return _write_addition(_best_addition(without[piece[0]], effects[piece[1]], like))
 
 
 def _write_addition(found: Fit | None) -> Piece | None:
-    """Return what `add_effect` found, without the terms; None if JSON cannot hold it."""
+    """Encode a result of `add_effect` for the cache; None if JSON cannot hold its parameters."""
     if found is None:
         return {}, None
-    effects = [(each.params.model_dump(mode="json"), each.levels) for each in found.effects]
-    for each, (written, _) in zip(found.effects, effects, strict=True):
-        if each.params.model_validate(json.loads(json.dumps(written))) != each.params:
+    effects = [(effect.params.model_dump(mode="json"), effect.levels) for effect in found.effects]
+    for effect, (written, _) in zip(found.effects, effects, strict=True):
+        if effect.params.model_validate(json.loads(json.dumps(written))) != effect.params:
             return None
     return ({"coefficients": found.coefficients, "scale_db": found.scale_db},
             {"effects": effects, "objective": float(found.objective)})
 
 
 def _reader(model: Model, effect: Effect) -> Callable[..., Fit | None]:
-    """Return what reads the fit of a model with one more effect."""
+    """Return the decoder of `_write_addition` for a model with one more effect."""
     def read(arrays: dict[str, np.ndarray], content: Any) -> Fit | None:
         if content is None:
             return None
@@ -268,7 +271,7 @@ def _reader(model: Model, effect: Effect) -> Callable[..., Fit | None]:
         for before, (written, levels) in zip((*model.effects, effect), content["effects"],
                                              strict=True):
             found = before.with_params(before.Params.model_validate(written), levels)
-            # The terms of those that are as they were need not be made again.
+            # Terms of unchanged effects need not be computed again.
             effects.append(before if before in model.effects and before.is_same(found) else found)
         return Fit(arrays["coefficients"], arrays["scale_db"], content["objective"],
                    model.with_effects(effects))
@@ -277,13 +280,14 @@ def _reader(model: Model, effect: Effect) -> Callable[..., Fit | None]:
 
 def _best_addition(fit: Fit, effect: Effect, like: Effect | None,
                    group: np.ndarray | None = None) -> Fit | None:
+    """Compute the result of `add_effect`: fit all kinds of proposals, return the likeliest."""
     view = fit.view if group is None else fit.view.of_group(group)
     proposals = effect.propose(view) if like is None else like.propose_like(view)
     kinds: dict[Any, list[Effect]] = {}
     for params in proposals:
         proposed = effect.with_params(params)
         kinds.setdefault(proposed.kind(), []).append(proposed)
-    found = [_best_of_a_kind(fit, each, like is not None) for each in kinds.values()]
+    found = [_best_of_a_kind(fit, same_kind, like is not None) for same_kind in kinds.values()]
     if not found:
         return None
     best = min(found, key=attrgetter("objective"))
@@ -296,6 +300,7 @@ def _best_addition(fit: Fit, effect: Effect, like: Effect | None,
 
 
 def _best_along_paths(fit: Fit, without: Fit) -> Fit:
+    """Compute the result of `along_paths`: exact levels, then descents while they gain enough."""
     best = with_exact_levels(_over_known_paths(fit))
     if not _is_exact(best) and best.channel.follows_paths:
         best = _exactly_beside(best)
@@ -312,41 +317,43 @@ def _best_along_paths(fit: Fit, without: Fit) -> Fit:
 
 
 def _best_of_a_kind(fit: Fit, proposed: list[Effect], is_fold: bool) -> Fit:
-    tried = [fit.model.with_effects([*fit.effects, each]) for each in proposed]
+    """Fit the most promising of proposals that differ in parameters only; refine the best fit."""
+    tried = [fit.model.with_effects([*fit.effects, effect]) for effect in proposed]
     if proposed[0].stage == "gain" and len(tried) > MAX_PROPOSALS:  # only gains have a score
-        tried.sort(key=lambda each: -fit.view.score(each.terms[-1].select(fit.train)))
+        tried.sort(key=lambda model: -fit.view.score(model.terms[-1].select(fit.train)))
         tried = tried[:MAX_PROPOSALS]
-    best = min((each.fit(fit) for each in tried), key=attrgetter("objective"))
+    best = min((model.fit(fit) for model in tried), key=attrgetter("objective"))
     if fit.objective - best.objective < MIN_GAIN_NATS:
         return best
     return refine(best, descents=1 if is_fold else DESCENTS)
 
 
 def _is_exact(fit: Fit) -> bool:
+    """Return True if the last effect uses exact levels along paths."""
     last = fit.effects[-1]
     return last.is_same(last.exactly())
 
 
 def _exactly_beside(fit: Fit) -> Fit:
-    """Look for better exact levels of the last effect, where those of its quick optimum are not.
+    """Search parameters of the last effect with exact levels, around the optimum of quick levels.
 
-    The optimum of both need not be the same. Only of few numbers, such as a position: each value
-    that is tried follows paths.
+    Used if exact levels are worse at that optimum; both optima may differ. Only for few parameters,
+    such as a position, because each evaluation traces paths.
     """
     last = fit.effects[-1]
     variation, exactly = last.variation(), last.exactly()
     if variation is None or exactly is None or len(variation.values) > MAX_EXACT_NUMBERS:
         return fit
-    beside = refine(fit.with_effect_at(-1, exactly), evaluations=EXACT_EVALUATIONS, descents=1,
-                    max_links=MAX_EXACT_LINKS)
-    return beside if beside.objective < fit.objective else fit
+    exact = refine(fit.with_effect_at(-1, exactly), evaluations=EXACT_EVALUATIONS, descents=1,
+                   max_links=MAX_EXACT_LINKS)
+    return exact if exact.objective < fit.objective else fit
 
 
 def _over_known_paths(fit: Fit, is_near: bool = False) -> Fit:
-    """Search for exact parameters of the last effect with levels that are nearly exact.
+    """Search parameters of the last effect with nearly exact levels from cached paths.
 
-    Those of known paths (`missing_obstacle`), of which a value takes milliseconds. Where the effect
-    knows none, or they are no better, the fit is returned as it is.
+    Evaluations take milliseconds (`missing_obstacle`). Returns the given fit if the effect has no
+    such levels, or they are not better.
     """
     last = fit.effects[-1]
     exact = last.exactly() if fit.channel.follows_paths else None
@@ -361,10 +368,10 @@ def _over_known_paths(fit: Fit, is_near: bool = False) -> Fit:
 
 
 def _near(fit: Fit, like: Effect) -> Fit:
-    """Return the best fit to a fold around the effect that was found on all links.
+    """Fit a fold with exact levels near the parameters that were found on all links.
 
-    Each number by itself a share of its step to both sides, and all that gain together: every fold
-    asks for the same exact levels, which are kept.
+    Tries each parameter NEAR_SHARE of its step to both sides, and all improvements together. So
+    every fold needs the same exact levels, which are cached.
     """
     def fitted(effect: Effect) -> Fit:
         return fit.with_effects([*fit.effects, effect])
@@ -374,27 +381,27 @@ def _near(fit: Fit, like: Effect) -> Fit:
         return best
     if not variation.follows_paths:
         return _over_known_paths(best, is_near=True)
-    start, numbers = best.objective, variation.values.copy()
+    start_nats, numbers = best.objective, variation.values.copy()
     for number, step in enumerate(variation.steps):
-        least = start
+        least_nats = start_nats
         for shift in (-NEAR_SHARE * step, NEAR_SHARE * step):
             values = variation.values.copy()
             values[number] += shift
             moved = fitted(variation.effect(np.clip(values, variation.low, variation.high)))
-            if moved.objective < least:
-                least, numbers[number] = moved.objective, values[number]
+            if moved.objective < least_nats:
+                least_nats, numbers[number] = moved.objective, values[number]
             best = min(best, moved, key=attrgetter("objective"))
     together = fitted(variation.effect(np.clip(numbers, variation.low, variation.high)))
     return min(best, together, key=attrgetter("objective"))
 
 
 def with_exact_levels(fit: Fit) -> Fit:
-    """Replace quick levels by the channel's exact ones in each effect, where that is better."""
+    """Replace quick levels of each effect by exact ones if that raises the likelihood."""
     if not fit.channel.follows_paths:
         return fit
-    for number, each in enumerate(fit.effects):
-        exactly = each.exactly()
-        if exactly is None or each.is_same(exactly):
+    for number, effect in enumerate(fit.effects):
+        exactly = effect.exactly()
+        if exactly is None or effect.is_same(exactly):
             continue
         other = fit.with_effect_at(number, exactly)
         if other.objective < fit.objective:

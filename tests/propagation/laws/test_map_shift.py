@@ -5,50 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import trimesh
 
-from radiotwin.links import LinkGeometry
 from radiotwin.propagation.laws.image_paths import fit_offsets, moved, paths_db
 from radiotwin.propagation.laws.map_error import NO_SHIFT, MapError, estimate_shift
-from radiotwin.scene.citymap import CityMap
-from radiotwin.scene.materials import itu_material
-from tests.propagation.links import powers_of_links
+from tests.propagation.laws.houses import flight, houses, levels, links_over
 
-DEVICES_M = np.array([[45.0, 42.0, 1.5], [100.0, 155.0, 1.5], [160.0, 60.0, 1.5]])
 DIFFUSE = (-140.0, 3.0)  # gain at 100 m [dB], and exponent
-
-
-def houses(shift_m=(0.0, 0.0), off_m=0.0, seed=0, material="concrete"):
-    """Nine houses, all moved alike, and each in its own way by a normal error."""
-    rng, boxes = np.random.default_rng(seed), []
-    for east in (10.0, 75.0, 140.0):
-        for north in (10.0, 75.0, 140.0):
-            low = np.array([east, north]) + shift_m + off_m * rng.normal(size=2)
-            boxes.append(trimesh.creation.box(bounds=[[*low, 0], [*(low + 25), 22]]))
-    mesh = trimesh.util.concatenate(boxes)
-    return CityMap(mesh.vertices, mesh.faces, [itu_material(material)])
-
-
-def flight(count, seed):
-    rng = np.random.default_rng(seed)
-    receiver_m = np.column_stack([rng.uniform(0, 175, (count, 2)), rng.uniform(25, 50, count)])
-    return receiver_m, rng.integers(0, 3, count)
-
-
-def links_over(city, receiver_m, device):
-    device_m = DEVICES_M[device]
-    los = city.line_of_sight(device_m, receiver_m)
-    return LinkGeometry(device_m, receiver_m, los, device, city, 2.4e9)
-
-
-def levels(city, receiver_m, device, seed, factors=(1.0, 1.0)):
-    """Levels of a world whose reflections and diffractions carry so many times their power."""
-    powers = powers_of_links(city, DEVICES_M, receiver_m, device)
-    diffracted = powers.diffracted + powers.reflected_diffracted + powers.diffracted_2
-    power = powers.direct + factors[1] * diffracted + factors[0] * (powers.total - powers.direct - diffracted)
-    distance_m = np.linalg.norm(receiver_m - DEVICES_M[device], axis=1)
-    power += 1e-14 * (distance_m / 100) ** -3.0
-    return 10 * np.log10(power) + np.random.default_rng(seed).normal(0, 1.0, len(device))
 
 
 @pytest.mark.slow
@@ -96,7 +58,7 @@ def test_offsets_of_reflections_and_diffractions_are_found():
     receiver_m, device = flight(400, 4)
     links = links_over(houses(), receiver_m, device)
     for true_db in ((0.0, 0.0), (-6.0, 0.0), (0.0, 5.0)):
-        level_db = levels(houses(), receiver_m, device, 5, 10 ** (np.array(true_db) / 10))
+        level_db = levels(houses(), receiver_m, device, 5, factors=10 ** (np.array(true_db) / 10))
         found = fit_offsets(links, level_db, None, DIFFUSE)
         assert np.abs(np.subtract(found, true_db)).max() < 2.0
         assert abs((found[0] - found[1]) - (true_db[0] - true_db[1])) < 1.5

@@ -4,51 +4,13 @@ import json
 
 import numpy as np
 import pytest
-import trimesh
 
 from radiotwin.errors import BadInput
-from radiotwin.links import LinkGeometry
 from radiotwin.propagation.laws.kriging import RegressionKriging
 from radiotwin.propagation.laws.map_error import MapError, estimate_map_error
 from radiotwin.propagation.laws.path_kriging import PathKriging
 from radiotwin.propagation.laws.registry import decode_both, encode_channel
-from radiotwin.scene.citymap import CityMap
-from tests.propagation.links import powers_of_links
-
-DEVICES_M = np.array([[45.0, 42.0, 1.5], [100.0, 155.0, 1.5], [160.0, 60.0, 1.5]])
-
-
-def houses(move_m=0.0, rise_m=0.0, seed=0):
-    """Nine houses; each side of each is off by a normal error, and so is the height."""
-    rng, boxes = np.random.default_rng(seed), []
-    for east in (10.0, 75.0, 140.0):
-        for north in (10.0, 75.0, 140.0):
-            low, high = np.array([east, north]), np.array([east + 25, north + 25])
-            low, high = low + move_m * rng.normal(size=2), high + move_m * rng.normal(size=2)
-            height = max(22 + rise_m * rng.normal(), 5)
-            boxes.append(trimesh.creation.box(bounds=[[*low, 0], [*high, height]]))
-    mesh = trimesh.util.concatenate(boxes)
-    return CityMap(mesh.vertices, mesh.faces)
-
-
-def links_over(city, receiver_m, device):
-    device_m = DEVICES_M[device]
-    los = city.line_of_sight(device_m, receiver_m)
-    return LinkGeometry(device_m, receiver_m, los, device, city, 2.4e9)
-
-
-def flight(count, seed):
-    rng = np.random.default_rng(seed)
-    receiver_m = np.column_stack([rng.uniform(0, 175, (count, 2)), rng.uniform(25, 50, count)])
-    return receiver_m, rng.integers(0, 3, count)
-
-
-def levels(city, receiver_m, device, seed, noise_db=1.0):
-    """Levels of a world whose paths the engine follows over the true map."""
-    powers = powers_of_links(city, DEVICES_M, receiver_m, device).total
-    distance_m = np.linalg.norm(receiver_m - DEVICES_M[device], axis=1)
-    powers = powers + 1e-13 * (distance_m / 100) ** -3.0
-    return 10 * np.log10(powers) + np.random.default_rng(seed).normal(0, noise_db, len(device))
+from tests.propagation.laws.houses import flight, houses, levels, links_over
 
 
 @pytest.mark.slow
@@ -56,10 +18,10 @@ def levels(city, receiver_m, device, seed, noise_db=1.0):
 def test_the_size_of_a_maps_errors_is_found(move_m, rise_m):
     """Rationale: the same paths over three other maps; only how the map was made wrong is not shared."""
     receiver_m, device = flight(300, 3)
-    level_db, blamed, outside = levels(houses(), receiver_m, device, 5), 0, 0
+    level_db, blamed, outside = levels(houses(), receiver_m, device, 5, diffuse=1e-13), 0, 0
     seeds = (11, 12, 13) if move_m or rise_m else (11,)
     for seed in seeds:
-        wrong = links_over(houses(move_m, rise_m, seed=seed), receiver_m, device)
+        wrong = links_over(houses(move_m=move_m, rise_m=rise_m, seed=seed), receiver_m, device)
         found, _ = estimate_map_error(wrong, level_db, None, 0)
         for (size_m, low_m, high_m), true_m in ((found.wall_m, move_m), (found.height_m, rise_m)):
             assert low_m <= size_m <= high_m
@@ -89,11 +51,11 @@ def test_error_of_a_map_is_kept_and_strange_ones_are_refused():
 def judged():
     """A model of 200 links over the true map, one over nine other houses, and 300 links to judge on."""
     receiver_m, device = flight(200, 1)
-    level_db = levels(houses(), receiver_m, device, 2)
+    level_db = levels(houses(), receiver_m, device, 2, diffuse=1e-13)
     there_m, to = flight(300, 8)
-    true_db = levels(houses(), there_m, to, 9, noise_db=0.0)
+    true_db = levels(houses(), there_m, to, 9, diffuse=1e-13, noise_db=0.0)
     found = {}
-    for name, city in (("right", houses()), ("wrong", CityMap(houses().vertices + [30.0, 30.0, 0.0], houses().faces))):
+    for name, city in (("right", houses()), ("wrong", houses(shift_m=(30.0, 30.0)))):
         links, held = links_over(city, receiver_m, device), links_over(city, there_m, to)
         model = PathKriging().fit(links, level_db, None, 0)
         law = RegressionKriging().fit(links, level_db, None, 0)

@@ -60,15 +60,17 @@ def test_nine_in_ten_fall_within_their_interval(fitted_nn, world):
 def test_equal_seeds_give_equal_bits_whatever_the_threads(world):
     data = world(40, 80)
     before, models = torch.get_num_threads(), []
+    states = torch.random.get_rng_state(), np.random.get_state()[1].copy()
     try:
         for threads, seed in ((1, 5), (2, 5), (2, 6)):
             torch.set_num_threads(threads)
             models.append(SegmentedNN().fit(data.links, data.level_db, None, seed=seed))
+            assert torch.get_num_threads() == threads, "fit restores it"
     finally:
         torch.set_num_threads(before)
     first, again, other = ({k: v.tobytes() for k, v in model.state()[0].items()} for model in models)
-    assert first == again
-    assert first != other
+    assert first == again != other
+    assert torch.equal(states[0], torch.random.get_rng_state()) and np.array_equal(states[1], np.random.get_state()[1])
 
 
 def test_table_is_the_mean_of_the_networks(fitted_nn):

@@ -48,28 +48,11 @@ def slab(permittivity, conductivity_s_per_m=0.0, thickness_m=0.1, frequency_hz=2
     return slabs_of([Material("slab", None, permittivity, conductivity_s_per_m, thickness_m, **others)], frequency_hz)
 
 
-@pytest.mark.parametrize("sine", [1e-3, 0.1, 0.5, 0.9, 1.0])
-def test_a_thick_lossy_slab_is_a_half_space(sine):
-    thick = slab(5.24, 0.09, thickness_m=50.0)
-    assert reflection(sine, thick, 0) == pytest.approx(fresnel(sine, thick.permittivity[0]), rel=1e-6)
-
-
 @pytest.mark.parametrize("sine", [0.01, 0.2, 0.7, 0.99])
 @pytest.mark.parametrize("thickness_m", [0.002, 0.1, 0.37])
 def test_a_slab_is_a_line_that_ends_in_free_space(line_of_slab, sine, thickness_m):
     ours = reflection(sine, slab(6.31, 0.0117, thickness_m), 0)
     assert ours == pytest.approx(line_of_slab(sine, 6.31, 0.0117, thickness_m), rel=1e-9)
-
-
-@pytest.mark.parametrize("sine", [0.2, 0.7, 1.0])
-def test_half_a_wave_is_transparent_and_a_quarter_reflects_most(sine):
-    """Born and Wolf, Principles of Optics, section 1.6.4: the slab as a plate of n sin(angle) = root."""
-    permittivity, wavelength_m = 4.0, 299_792_458.0 / 2.4e9
-    wave_in_slab_m = wavelength_m / np.sqrt(permittivity - (1 - sine**2))
-    assert np.allclose(reflection(sine, slab(permittivity, thickness_m=wave_in_slab_m / 2), 0), 0, atol=1e-9)
-    quarter = reflection(sine, slab(permittivity, thickness_m=wave_in_slab_m / 4), 0)
-    for got, one_side in zip(quarter, fresnel(sine, complex(permittivity))):
-        assert got == pytest.approx(2 * one_side / (1 + one_side**2))
 
 
 def test_no_slab_reflects_more_than_all_and_none_of_no_thickness():

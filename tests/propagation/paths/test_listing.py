@@ -10,7 +10,6 @@ from scipy.constants import speed_of_light
 from radiotwin.errors import BadInput
 from radiotwin.propagation.paths.listing import list_paths
 from radiotwin.scene.antennas import Antenna, Pattern
-from tests.propagation.links import powers_of_links
 
 pytestmark = pytest.mark.seconds
 
@@ -61,15 +60,6 @@ def test_figures_are_those_of_the_paths_of_each_link(listed, small_scene):
             assert first["departure_azimuth_deg"] == pytest.approx(np.degrees(np.arctan2(way_m[0], way_m[1])) % 360)
             assert first["departure_elevation_deg"] == pytest.approx(
                 np.degrees(np.arcsin(way_m[2] / np.linalg.norm(way_m))))
-
-
-def test_gains_are_those_of_the_powers(listed, small_scene):
-    made, _ = listed
-    device = np.repeat(np.arange(len(small_scene.device_m)), len(POINTS_M))
-    total = powers_of_links(small_scene.city, small_scene.device_m, np.tile(POINTS_M, (len(small_scene.device_m), 1)),
-                            device, small_scene.config.radio.frequency_hz).total
-    found = made["reason"].to_numpy() == ""
-    assert np.allclose(made["gain_db"].to_numpy()[found], 10 * np.log10(total[found]))
 
 
 def test_antennas_act_in_the_directions_of_each_path(small_scene):

@@ -7,7 +7,7 @@ from scipy.constants import speed_of_light
 
 from radiotwin.errors import BadInput
 from radiotwin.propagation.paths import path_powers
-from radiotwin.propagation.paths.powers import COMPONENTS, PathDirections
+from radiotwin.propagation.paths.powers import COMPONENTS
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.materials import itu_material
 from tests.propagation.links import powers_of_links
@@ -58,14 +58,6 @@ def test_only_the_weakest_directions_are_left_out(town, links):
     reached = powers.total > 0
     assert (np.abs(kept / powers.total - 1)[reached] < 1.1e-5).all() and not kept[~reached].any()
     assert (np.diff(powers.directions.link) >= 0).all()
-
-
-def test_directions_of_some_links():
-    link = np.array([0, 0, 2, 3, 3, 3])
-    every = PathDirections(link, np.arange(6.0), *np.zeros((2, 6, 3)))
-    some = every.of_links(np.array([3, 1, 0, 3]))
-    assert some.link.tolist() == [0, 0, 0, 2, 2, 3, 3, 3]
-    assert some.power.tolist() == [3, 4, 5, 0, 1, 3, 4, 5]
 
 
 def test_only_the_ground(line_of_slab):
