@@ -92,7 +92,7 @@ def fit_along_paths(links: Links, scene: Scene, seed: int, start: Twin | None,
 
 
 def fit_paths(links: Links, scene: Scene, law: Twin, relocation: Relocation) -> Twin:
-    """Locate unknown devices along paths, and fit the diffuse power of `image_paths`.
+    """Locate unknown devices along paths, and fit the diffuse power of `paths`.
 
     Args:
         links: n links.

@@ -13,8 +13,8 @@ from radiotwin.inference.gaussian import Limit, LogDistanceLine
 from radiotwin.inference.held_out import deal_groups
 from radiotwin.links import LinkGeometry
 from radiotwin.propagation.laws import ChannelModel
+from radiotwin.propagation.laws.base import ground_blocks
 from radiotwin.propagation.laws.log_distance import LogDistance, SegmentedLogDistance
-from radiotwin.propagation.laws.segmented_nn import BLOCK_M
 
 LAW = "law"  # key in the provenance of a twin
 GROUPS = 10  # groups of links that the jackknife leaves out in turn
@@ -33,8 +33,7 @@ def law_parameters(channel: ChannelModel, links: LinkGeometry, level_db: np.ndar
     """Return the parameters of a channel's law with 90 % intervals.
 
     The intervals are by a delete-a-group jackknife (Kott 2001, 'The delete-a-group jackknife',
-    Journal of Official Statistics 17). A block of one device and `BLOCK_M` of ground stays in one
-    group, since errors of neighbouring links are correlated.
+    Journal of Official Statistics 17). All links of a block (`ground_blocks`) are in one group.
 
     Args:
         channel: channel fitted to the links.
@@ -51,9 +50,7 @@ def law_parameters(channel: ChannelModel, links: LinkGeometry, level_db: np.ndar
         return []
     values = _values(law)
     spread = np.full(len(values), np.nan)
-    cell = np.floor(links.receiver_m[:, :2] / BLOCK_M).astype(np.int64)
-    block = np.unique(np.column_stack([links.device, cell]), axis=0, return_inverse=True)[1]
-    group = deal_groups(block.ravel(), GROUPS, np.random.default_rng(seed))
+    group = deal_groups(ground_blocks(links), GROUPS, np.random.default_rng(seed))
     groups = int(group.max()) + 1
     if groups > 2:
         limits_db = np.broadcast_to(np.asarray(-np.inf if limit_db is None else limit_db, float),

@@ -12,8 +12,7 @@ from radiotwin.inference.gaussian import Limit, limits_of, mean_if_detected
 from radiotwin.inference.held_out import deal_groups
 from radiotwin.links import LinkGeometry
 from radiotwin.propagation.laws import channel_named, fit_once
-from radiotwin.propagation.laws.base import MIN_DETECTED
-from radiotwin.propagation.laws.segmented_nn import BLOCK_M
+from radiotwin.propagation.laws.base import BLOCK_M, MIN_DETECTED
 
 AUTO = "auto"
 HELD_OUT, LOCATED_BY = "held_out", "located_by"  # in the provenance of a twin

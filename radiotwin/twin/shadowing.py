@@ -51,8 +51,8 @@ class MapErrors:
             seed: of the random subset of links.
         """
         located = np.array([device.located for device in twin.devices])
-        sample = links.select(_sampled(links.device, located[links.device]
-                                       & np.isfinite(links.level_db), seed)).with_located_devices(twin.device_m)
+        rows = _sampled(links.device, located[links.device] & np.isfinite(links.level_db), seed)
+        sample = links.select(rows).with_located_devices(twin.device_m)
         if not len(sample):
             return cls()
         predicted = twin.predict(sample)

@@ -33,6 +33,7 @@ from tests.coverage.conftest import write_scene
 
 A_DB, EXPONENT, SD_DB = -40.0, 2.6, 1.5
 PLACES_M = {"a": (60.0, 60.0), "b": (330.0, 90.0), "c": (80.0, 320.0), "u": (230.0, 240.0)}
+ABC_DBM = {"a": 0.0, "b": 20.0, "c": 10.0}  # transmit powers
 Z_M, UP_M = 1.5, 40.0
 
 
@@ -76,6 +77,17 @@ def campaign(folder, devices, column="rssi_dbm", boresights_deg=None, seed=0, li
     return read_measurements(folder / "measurements.csv")
 
 
+def powered(folder, powers_dbm, **settings):
+    """A campaign of devices (name -> declared transmit power [dBm])."""
+    return campaign(folder, {name: {"tx_power_dbm": power, "adds_db": power} for name, power in powers_dbm.items()}, **settings)
+
+
+def at_points(grid, height_m=40.0):
+    """Points (n, 3) of a grid, as maps are raveled [m]."""
+    x_m, y_m = (axis.ravel() for axis in np.meshgrid(grid.x_m, grid.y_m))
+    return np.column_stack([x_m, y_m, np.full(len(x_m), height_m)])
+
+
 def predicted_db(twin, scene, names, at_m):
     row = [[each.device for each in twin.devices].index(name) for name in names]
     return twin.predict(twin.links(np.tile(at_m, (len(row), 1)), np.array(row), scene)).mean_db
@@ -89,7 +101,7 @@ def ground(tmp_path_factory):
 
 def test_powers_of_anchors_and_of_an_unknown_device(ground, tmp_path):
     powers = {"a": 0.0, "b": 20.0, "c": 10.0, "u": 27.0}
-    data = campaign(tmp_path / "m", {name: {"tx_power_dbm": power, "adds_db": power} for name, power in powers.items()})
+    data = powered(tmp_path / "m", powers)
     twin = fit_twin(data, ground, model="log_distance")
     located = twin.devices[3]
     assert np.hypot(located.x_m - 230, located.y_m - 240) < 5 and located.credible_radius_m < 10
@@ -195,8 +207,7 @@ def test_a_new_transmitters_antenna_counts_once_where_the_devices_declare_theirs
     planned = read_transmitters(tmp_path / "tx.csv", ground)
     settings = CoverageSettings(step_m=40.0, height_m=40.0, extent_m=(0, 400, 0, 400))
     coverage = predict_coverage(fit_twin(data, ground, model="log_distance"), ground, planned, settings)
-    x_m, y_m = (axis.ravel() for axis in np.meshgrid(coverage.grid.x_m, coverage.grid.y_m))
-    expected_dbm = 10 + truth_db((200, 100, 1.5), np.column_stack([x_m, y_m, np.full(len(x_m), 40.0)]), 0.0)
+    expected_dbm = 10 + truth_db((200, 100, 1.5), at_points(coverage.grid), 0.0)
     error_db = coverage.dataset["received_power_dbm"].values.ravel() - expected_dbm
     assert abs(np.median(error_db)) < 0.3 and np.abs(error_db).max() < 1.0
     assert not any("twice" in note for note in coverage.summary["notes"])
@@ -207,15 +218,13 @@ def test_a_new_transmitters_antenna_counts_once_where_the_devices_declare_theirs
 
 
 def test_coverage_of_a_twin_of_known_powers_has_other_transmitters(ground, tmp_path):
-    data = campaign(tmp_path / "m", {name: {"tx_power_dbm": power, "adds_db": power} for name, power in zip("abc", (0.0, 20.0, 10.0))})
-    twin = fit_twin(data, ground, model="log_distance")
+    twin = fit_twin(powered(tmp_path / "m", ABC_DBM), ground, model="log_distance")
     (tmp_path / "tx.csv").write_text("device,x_m,y_m,z_m,tx_power_dbm\nnew,200,100,1.5,17\nlater,100,200,1.5,\na,60,60,1.5,\n")
     planned = read_transmitters(tmp_path / "tx.csv", ground)
     settings = CoverageSettings(step_m=40.0, height_m=40.0, extent_m=(0, 400, 0, 400), tx_power_dbm=3.0)
     for name, place_m, power_dbm in (("new", (200, 100), 17.0), ("later", (100, 200), 3.0), ("a", (60, 60), 0.0)):
         coverage = predict_coverage(twin, ground, planned, settings, devices=[name])
-        x_m, y_m = (axis.ravel() for axis in np.meshgrid(coverage.grid.x_m, coverage.grid.y_m))
-        expected_dbm = power_dbm + truth_db((*place_m, 1.5), np.column_stack([x_m, y_m, np.full(len(x_m), 40.0)]))
+        expected_dbm = power_dbm + truth_db((*place_m, 1.5), at_points(coverage.grid))
         np.testing.assert_allclose(coverage.dataset["received_power_dbm"].values.ravel(), expected_dbm, atol=0.8)
 
 
@@ -229,16 +238,18 @@ def test_two_carriers_are_moved_by_20_lg_f(ground, tmp_path):
     np.testing.assert_allclose(predicted_db(twin, ground, "abc", at_m), expected_db, atol=0.5)
 
 
-def test_a_later_file_is_located_by_its_own_powers(ground, tmp_path):
-    twin = fit_twin(campaign(tmp_path / "m", {name: {"tx_power_dbm": power, "adds_db": power}
-                                              for name, power in zip("abc", (0.0, 20.0, 10.0))}), ground, model="log_distance")
-    later = campaign(tmp_path / "later", {"u": {"tx_power_dbm": 27.0, "adds_db": 27.0}}, seed=1)
+def test_a_later_file_is_located_and_predicted_by_its_own_powers(ground, tmp_path):
+    twin = fit_twin(powered(tmp_path / "m", ABC_DBM), ground, model="log_distance")
+    later = powered(tmp_path / "later", {"u": 27.0}, seed=1)
     found, _ = locate_devices(later, twin, ground)
     assert np.hypot(found["x_m"][0] - 230, found["y_m"][0] - 240) < 8
     silent = campaign(tmp_path / "silent", {"u": {"adds_db": 10.0}}, seed=1)
     found, notes = locate_devices(silent, twin, ground)
     assert any("tx_power_dbm of u is not declared and taken for 10 dBm, the median of the twin's devices" in note for note in notes)
     assert np.hypot(found["x_m"][0] - 230, found["y_m"][0] - 240) < 8
+    changed = powered(tmp_path / "changed", {"b": 5.0}, seed=3)
+    error_db = predict(twin, ground, changed) - changed.level_db
+    assert abs(error_db.mean()) < 0.5 and error_db.std() < 2
 
 
 def test_antennas_act_along_each_path_where_paths_are_followed(ground, tmp_path):
@@ -290,12 +301,11 @@ def test_a_survey_through_antennas_of_the_scene_is_learnt_without_them(tmp_path)
 
 
 def test_a_twins_map_tells_coverage_the_powers(ground, tmp_path):
-    powers = {"a": 0.0, "b": 20.0, "c": 10.0}
-    data = campaign(tmp_path / "m", {name: {"tx_power_dbm": power, "adds_db": power} for name, power in powers.items()})
+    data = powered(tmp_path / "m", ABC_DBM)
     radio_map = fit_twin(data, ground, model="log_distance").radio_map(ground)
     radio_map.save(tmp_path / "map.nc")
     again = RadioMap.load(tmp_path / "map.nc")
-    assert again.tx_power_dbm == powers
+    assert again.tx_power_dbm == ABC_DBM
     coverage = predict_coverage(again, ground)
     assert [each["tx_power_dbm"] for each in coverage.summary["transmitters"]] == [0.0, 20.0, 10.0]
     strongest_dbm = (again.gain_db[:, 0] + np.array([0.0, 20.0, 10.0])[:, None, None]).max(axis=0)
@@ -303,14 +313,6 @@ def test_a_twins_map_tells_coverage_the_powers(ground, tmp_path):
     for wrong in ('{"a": 1e9}', '["a"]', "{", "7"):
         again.dataset.attrs["device_tx_power_dbm"] = wrong
         assert "not powers of devices" in form_problem(again.dataset)
-
-
-def test_a_comparison_takes_powers_as_they_are_declared_by_then(ground, tmp_path):
-    twin = fit_twin(campaign(tmp_path / "m", {name: {"tx_power_dbm": 20.0, "adds_db": 20.0} for name in "abc"}), ground,
-                    model="log_distance")
-    later = campaign(tmp_path / "later", {"a": {"tx_power_dbm": 5.0, "adds_db": 5.0}}, seed=3)
-    error_db = predict(twin, ground, later) - later.level_db
-    assert abs(error_db.mean()) < 0.5 and error_db.std() < 2
 
 
 def lobe_dbi(elevation_deg):
@@ -349,9 +351,8 @@ def test_the_antenna_of_the_uavs_is_taken_off_and_put_back_where_uavs_receive(gr
 
 
 def test_held_out_errors_of_a_close_loop_are_those_of_the_gains(ground, tmp_path):
-    powers = {"a": 0.0, "b": 20.0, "c": 10.0}
-    data = campaign(tmp_path / "m", {name: {"tx_power_dbm": power, "adds_db": power} for name, power in powers.items()})
-    gains = data.table.assign(gain_db=data.table["rssi_dbm"] - data.table["device"].map(powers)).drop(columns="rssi_dbm")
+    data = powered(tmp_path / "m", ABC_DBM)
+    gains = data.table.assign(gain_db=data.table["rssi_dbm"] - data.table["device"].map(ABC_DBM)).drop(columns="rssi_dbm")
     errors_db = []
     for each in (data, Measurements(gains, data.devices.drop(columns="tx_power_dbm"))):
         links = prepare_links(each, ground)

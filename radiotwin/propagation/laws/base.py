@@ -17,6 +17,7 @@ from radiotwin.errors import BadInput
 from radiotwin.inference.gaussian import Limit, limits_of
 from radiotwin.links import LinkGeometry, Links
 
+BLOCK_M = 100.0  # side of a square of ground in which errors of a device's links are correlated
 MIN_DETECTED = 20  # detected links needed to learn a line and its standard deviation
 LEVEL_SD_DB = 20.0  # prior standard deviation of a refitted level: weak
 SLOPE_SD_DB = 10.0  # and of its slope [dB per decade]: one unit of the path-loss exponent
@@ -202,6 +203,16 @@ def drop_uninformative(links: LinkGeometry, level_db: np.ndarray, limit_db: Limi
         "limit of detection is not known: the channel will look better than it is. Give the "
         "receiver's sensitivity.", stacklevel=3)
     return links.select(~missing), level_db[~missing], limits_db[~missing]
+
+
+def ground_blocks(links: LinkGeometry) -> np.ndarray:
+    """Return the index (n,) of each link's device and square of ground (`BLOCK_M`).
+
+    Links of one block share obstacles, so their errors are correlated.
+    """
+    square = np.floor(links.receiver_m[:, :2] / BLOCK_M).astype(np.int64)
+    block = np.column_stack([links.device, square])
+    return np.unique(block, axis=0, return_inverse=True)[1].ravel()
 
 
 def require_names(what: str, given: Collection[str], expected: Collection[str]) -> None:

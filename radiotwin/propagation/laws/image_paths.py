@@ -15,11 +15,11 @@ from typing_extensions import override
 
 from radiotwin.inference.gaussian import Limit, limits_of
 from radiotwin.inference.student import DOF, ReadingLaw
-from radiotwin.links import LinkGeometry, Links
-from radiotwin.links import design_effect as design_effect_of
+from radiotwin.links import LinkGeometry, Links, design_effect
 from radiotwin.propagation.laws.base import (
     ANY_LEVEL_SD_DB,
     ChannelModel,
+    ground_blocks,
     require_names,
     require_number,
 )
@@ -32,7 +32,6 @@ from radiotwin.propagation.laws.followed_paths import (
 from radiotwin.propagation.laws.log_distance import SegmentedLogDistance
 from radiotwin.propagation.laws.published import free_space_db
 
-BLOCK_M = 100.0  # side of a square of ground in which a device's links have a common error
 MIN_NLOS = 30  # NLoS links needed to fit the diffuse power
 DIFFUSE_DEFAULT = (-150.0, 3.0)  # nearly no power; the exponent then does not matter
 DIFFUSE_BOUNDS = np.array([[-150.0, 2.0], [-60.0, 6.0]])  # of gain at 100 m [dB] and exponent
@@ -128,18 +127,6 @@ class LinkFit:
             nll[of_class] = ReadingLaw(mean_db, errors_db, limits_db, DOF).nll(level_db)
             z[of_class] = np.nan_to_num((level_db - mean_db) / errors_db)
         return nll, z
-
-
-def block_design_effect(links: LinkGeometry, z: np.ndarray) -> float:
-    """Return how many links carry the information of one independent link (design effect).
-
-    Args:
-        links: n links; those of one device and one square of BLOCK_M have correlated errors.
-        z: (n,) residuals over their scale.
-    """
-    block = np.column_stack([links.device, np.floor(links.receiver_m[:, :2] / BLOCK_M)])
-    label = np.unique(block, axis=0, return_inverse=True)[1].reshape(-1)
-    return design_effect_of(label, z)
 
 
 class ImagePaths(ChannelModel):
@@ -338,13 +325,13 @@ def fit_offsets(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
     fit, gains = LinkFit(level_db, limit_db), interaction_gains(links)
     distance_m = links.distance_m
     undisturbed_db = _level_db(gains, distance_m, diffuse, np.zeros(2))
-    design_effect = block_design_effect(links, fit.fit(links.los, undisturbed_db)[1])
+    variance_factor = design_effect(ground_blocks(links), fit.fit(links.los, undisturbed_db)[1])
 
     def loss(offsets_db: np.ndarray) -> float:
         clipped_db = np.clip(offsets_db, -MAX_OFFSET_DB, MAX_OFFSET_DB)
         prior = 0.5 * (offsets_db**2).sum() / OFFSET_SD_DB**2
         level_db = _level_db(gains, distance_m, diffuse, clipped_db)
-        return fit.fit(links.los, level_db)[0].sum() / design_effect + float(prior)
+        return fit.fit(links.los, level_db)[0].sum() / variance_factor + float(prior)
 
     simplex = np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 3.0]])
     found = minimize(loss, np.zeros(2), method="Nelder-Mead",

@@ -17,14 +17,13 @@ import numpy as np
 from scipy.stats import ttest_1samp
 
 from radiotwin.inference.gaussian import Limit, limits_of
-from radiotwin.links import LinkGeometry
-from radiotwin.propagation.laws.base import require_names, require_number
+from radiotwin.links import LinkGeometry, design_effect
+from radiotwin.propagation.laws.base import ground_blocks, require_names, require_number
 from radiotwin.propagation.laws.image_paths import (
     MAX_OFFSET_DB,
     ImagePaths,
     LinkFit,
     Offsets,
-    block_design_effect,
     fit_offsets,
     moved,
     paths_db,
@@ -104,8 +103,8 @@ def _estimate_sizes(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
             if link_nll.sum() < nll.min():
                 z = link_z
             nll[wall, height] = link_nll.sum()
-        design_effect = block_design_effect(links, z)
-        drop = INTERVAL_NATS * design_effect
+        variance_factor = design_effect(ground_blocks(links), z)
+        drop = INTERVAL_NATS * variance_factor
         likely = [np.flatnonzero(nll.min(axis=1 - axis) - nll.min() <= drop) for axis in range(2)]
         # Trace paths over maps with larger errors only if these may be likely.
         at_end = [steps[-1] == STEPS * last and last < len(WALL_SIZES_M) - 1
@@ -114,7 +113,7 @@ def _estimate_sizes(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
             best = np.unravel_index(nll.argmin(), nll.shape)
             wall_m, height_m = (_size(*args) for args in zip(
                 best, likely, (WALL_SIZES_M, HEIGHT_SIZES_M), strict=True))
-            return _Sizes(wall_m, height_m, float(nll.min()), design_effect)
+            return _Sizes(wall_m, height_m, float(nll.min()), variance_factor)
         last_traced = [last + wider for last, wider in zip(last_traced, at_end, strict=True)]
 
 

@@ -24,6 +24,7 @@ from radiotwin.propagation.laws.base import (
     MAX_SD_DB,
     ChannelModel,
     drop_uninformative,
+    ground_blocks,
     require_array,
     require_names,
 )
@@ -43,7 +44,6 @@ BATCH = 256  # links in a step
 STEPS = 1200  # maximum
 CHECK_EVERY = 20  # steps between two evaluations of the held-out loss
 PATIENCE = 300  # training ends after so many steps in which no member improved
-BLOCK_M = 100.0  # side of a square of ground whose links are held out together
 TABLE = 129  # nodes on each axis of the table of residuals
 TRIM = 0.005  # quantile at both ends of the data beyond which the residual is held constant
 MAX_HIDDEN, MAX_WEIGHT, MAX_DECADES = 4096, 1e6, 20.0  # bounds of networks in a file
@@ -353,9 +353,6 @@ def _coordinates(links: LinkGeometry) -> np.ndarray:
 def _folds(links: LinkGeometry, rng: np.random.Generator) -> np.ndarray:
     """Return the index (n,) of the network that holds out each link.
 
-    All links of one device in one square of BLOCK_M have the same one: neighbouring links share
-    their obstacles, so that early stopping on single links would overfit.
+    All links of a block have the same one: early stopping on single links would overfit.
     """
-    cell = np.floor(links.receiver_m[:, :2] / BLOCK_M).astype(np.int64)
-    block = np.unique(np.column_stack([links.device, cell]), axis=0, return_inverse=True)[1]
-    return deal_groups(block.ravel(), MEMBERS, rng)
+    return deal_groups(ground_blocks(links), MEMBERS, rng)

@@ -111,7 +111,7 @@ def find_paths(surfaces: Surfaces, candidates: Candidates, device_m: np.ndarray,
     windows = np.empty((MAX_INTERACTIONS + 1, 4))
     frame = np.empty((3, 4))
     found = narrowed = 0
-    is_lit, way = False, -1  # candidate for which `image` and `windows` were computed
+    is_lit, computed = False, -1  # candidate of `image` and `windows`; -1: none
     for row in range(cursor // n, len(candidates.edge)):
         before = sequence_length(candidates.before, row)
         after = sequence_length(candidates.after, row)
@@ -119,14 +119,15 @@ def find_paths(surfaces: Surfaces, candidates: Candidates, device_m: np.ndarray,
         edge = candidates.edge[row]
         count = 0
         if edge < 0:
-            way = -1
+            computed = -1
             if not source_images(planes, facets_before, device_m, image):
                 continue
             count = through_facet(planes, facets_before[-1], image[before], receiver_m, spheres,
                                   possible)
         else:
-            if way >= 0 and _same_way(candidates, way, row):
-                narrowed = min(narrowed, _same_facets(candidates.after, way, row))
+            # Images and windows of the candidate before hold as far as both share facets
+            if computed >= 0 and _same_start(candidates, computed, row):
+                narrowed = min(narrowed, _same_facets(candidates.after, computed, row))
             else:
                 narrowed = 0
                 is_lit = source_images(planes, facets_before, device_m, image)
@@ -137,7 +138,7 @@ def find_paths(surfaces: Surfaces, candidates: Candidates, device_m: np.ndarray,
                     lit_m[0], lit_m[1] = lit_part(planes, edges, edge, facets_before, image)
                     open_window(edges, edge, lit_m, windows[0])
                     is_lit = lit_m[0] < lit_m[1]
-            way = row
+            computed = row
             is_open = is_lit
             while is_open and narrowed < after:
                 windows[narrowed + 1] = windows[narrowed]
@@ -148,7 +149,7 @@ def find_paths(surfaces: Surfaces, candidates: Candidates, device_m: np.ndarray,
                 count = over_edge(planes, edges, edge, facets_after, windows[after], source_m,
                                   receiver_m, spheres, frame, possible)
         along_m, across_m = source_m
-        for i in range(count):
+        for i in range(count):  # of bounding shapes; check triangles and find the points
             at = possible[i]
             if row * n + at < cursor:
                 continue
@@ -174,7 +175,7 @@ def find_paths(surfaces: Surfaces, candidates: Candidates, device_m: np.ndarray,
 
 
 @njit(cache=True, error_model="numpy")
-def _same_way(candidates: Candidates, row: int, other: int) -> bool:
+def _same_start(candidates: Candidates, row: int, other: int) -> bool:
     """Return True if two candidates have the same edge and the same facets before it."""
     same = candidates.edge[row] == candidates.edge[other]
     for k in range(candidates.before.shape[1]):

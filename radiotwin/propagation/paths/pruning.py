@@ -139,6 +139,7 @@ def narrow(planes: np.ndarray, edges: np.ndarray, edge: int, after: np.ndarray, 
     row = edges[edge]
     corners = np.empty((6, 4))
     x, y, at_m, across_m, least_m, corner = corners
+    # Corners of the mirrored rectangle: position along the edge, and x, y across it
     for i in range(4):
         for axis in range(3):
             corner[axis] = planes[facet, ORIGIN + axis] \
@@ -153,12 +154,14 @@ def narrow(planes: np.ndarray, edges: np.ndarray, edge: int, after: np.ndarray, 
         x[i] = dot(corner, row[TANGENT:TANGENT + 3])
         y[i] = dot(corner, row[NORMAL_0:NORMAL_0 + 3])
         across_m[i] = np.sqrt(x[i] * x[i] + y[i] * y[i])
+    # Least distance from the edge's line, by the component towards the middle of the facet
     centre_x, centre_y = x.sum(), y.sum()
     size = np.sqrt(centre_x * centre_x + centre_y * centre_y)
     for i in range(4):
         least_m[i] = (centre_x * x[i] + centre_y * y[i]) / size if size > 0.0 else 0.0
     if source_m[1] + least_m.min() <= ROUNDING_M:
         least_m[:] = 0.0
+    # Narrow the positions along the edge
     low_m, high_m = np.inf, -np.inf
     for i in range(4):
         to_nearest_m = at_m[i] * source_m[1] / (source_m[1] + least_m[i])
@@ -169,6 +172,7 @@ def narrow(planes: np.ndarray, edges: np.ndarray, edge: int, after: np.ndarray, 
     window[1] = min(window[1], source_m[0] + high_m + ROUNDING_M)
     if window[0] >= window[1]:
         return False
+    # Narrow the angles around the edge, unless the facet's are two parts of the window
     least_rad, most_rad = np.inf, -np.inf  # from the facet's middle
     for i in range(4):
         aside_rad = np.arctan2(centre_x * y[i] - centre_y * x[i], centre_x * x[i] + centre_y * y[i])
@@ -337,6 +341,7 @@ def over_edge(planes: np.ndarray, edges: np.ndarray, edge: int, after: np.ndarra
     cosine, sine = np.cos(window[3]), np.sin(window[3])
     hx, hy, hz = sine * tx - cosine * nx, sine * ty - cosine * ny, sine * tz - cosine * nz
     count = 0
+    # First the spheres around groups of receivers, then the receivers of those that remain
     for group in range(len(spheres)):
         rx, ry, rz = spheres[group, 0], spheres[group, 1], spheres[group, 2]
         reach_m = spheres[group, 3]
