@@ -4,6 +4,7 @@ import gzip
 import os
 import re
 import tracemalloc
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,15 @@ import pandas as pd
 import pytest
 
 from radiotwin.errors import BadInput
-from radiotwin.io.cells import as_numbers, cell_text, listed, read_cells, write_csv
+from radiotwin.io.cells import (
+    CsvLayout,
+    as_numbers,
+    cell_text,
+    listed,
+    read_cells,
+    read_table,
+    write_csv,
+)
 
 ROOT = Path(__file__).parents[2]
 MIB = 2**20
@@ -238,3 +247,58 @@ def test_numbers_of_thousands_of_digits():
 def test_long_cells_and_many_columns_are_cut_in_messages():
     assert cell_text("a'b") == repr("a'b") and len(cell_text("x" * 10**6)) < 100 and "\x1b" not in cell_text("\x1b[2J")
     assert listed("ab") == "a, b" and listed(map(str, range(1000))).endswith("49, … (1,000 columns)")
+
+
+def layout(data: bytes) -> CsvLayout:
+    layout = CsvLayout(Path("t.csv"))
+    layout.check(BytesIO(data))
+    return layout
+
+
+@pytest.mark.parametrize("first", [b"", b'"1,",2\n'])
+def test_rows_are_counted_the_same_over_blocks_and_with_quotation_marks(monkeypatch, first):
+    monkeypatch.setattr("radiotwin.io.cells._BLOCK_BYTES", 64)
+    rows = [f"{i},{'x' * (i % 90)}".encode() for i in range(300)]
+    found = layout(b"a,b\n" + first + b"\n".join(rows))
+    assert found.header == ["a", "b"] and found.rows == 301 + bool(first)
+    assert not found.has_apostrophes and layout(b"a,b\n" + b"\n".join([*rows, b"1,'"])).has_apostrophes
+    rows[250] += b",1"
+    with pytest.raises(BadInput, match=rf"row {252 + bool(first)} has 3 fields, the header has 2"):
+        layout(b"a,b\n" + first + b"\n".join(rows))
+
+
+@pytest.mark.parametrize("data", [b"a" * (24 * MIB), b"a,b\n" + b"0" * (24 * MIB)], ids=["header", "row"])
+def test_one_endless_line_is_refused_before_it_is_memory(monkeypatch, data):
+    monkeypatch.setenv("RADIOTWIN_MAX_ROW_BYTES", str(2 * MIB))
+    file = BytesIO(data)
+    tracemalloc.start()
+    try:
+        with pytest.raises(BadInput, match="RADIOTWIN_MAX_ROW_BYTES"):
+            CsvLayout(Path("t.csv")).check(file)
+        assert tracemalloc.get_traced_memory()[1] < 16 * MIB
+    finally:
+        tracemalloc.stop()
+
+
+KINDS = {"flight": "text", "time_s": "number", "x_m": "number or nothing", "los": "0 or 1"}
+HEADER = "flight,time_s,x_m,los,other\n"
+
+
+def test_columns_have_their_kinds(tmp_path):
+    path = tmp_path / "table.csv"
+    path.write_text(HEADER + "7,0.5,,1,<b>\nNA,2,3,0,<b>\n")
+    table = read_table(path, KINDS, {"other": "text", "missing": "number"})
+    assert list(table) == [*KINDS, "other"] and table["flight"].tolist() == ["7", "NA"]
+    np.testing.assert_array_equal(table[["time_s", "x_m", "los"]], [[0.5, np.nan, 1], [2, 3, 0]])
+
+
+@pytest.mark.parametrize("row, words", [
+    ("f,<img>,1,1,", "row 2, column time_s: '<img>' is not a number"), ("f,,1,1,", "column time_s"),
+    ("f,nan,1,1,", "column time_s"), ("f,1e308,1,1,", "column time_s"), ("f,1,inf,1,", "column x_m"),
+    ("f,1,2e7,1,", r"column x_m: '2e7' is not a number within ±1e\+07"), ("f,1,1,2,", "column los"),
+    ("f,1,1,,", "column los"), ("f,1,1", "3 fields"), ("f,1,1," + "9" * 5000 + ",", "column los")])
+def test_other_cells_are_refused(tmp_path, row, words):
+    path = tmp_path / "table.csv"
+    path.write_text(HEADER + row + "\n")
+    with pytest.raises(BadInput, match=words):
+        read_table(path, KINDS)
