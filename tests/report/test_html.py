@@ -189,7 +189,7 @@ def test_long_tables_texts_and_lists_are_cut_and_counted(tmp_path):
     rows = [[f"row {n}", float(n)] for n in range(html.MAX_ROWS + 7)]
     html.write_page("run.html", tmp_path / "page.html", {
         "title": "t" * 10**6, "page_title": "t", "viewer": None, "lead": [], "notes": [f"note {n}" for n in range(10_000)],
-        "closeloop": None, "comparison": None, "planning": None, "facts": ["f"],
+        "closeloop": None, "comparison": None, "planning": None, "law": None, "marks": [], "facts": ["f"],
         "estimates": Table(("device", "x"), rows)})
     text = (tmp_path / "page.html").read_text()
     assert len(text) < 10**6 and text.count("<tr>") == html.MAX_ROWS + 1

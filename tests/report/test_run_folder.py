@@ -178,3 +178,15 @@ def test_a_close_loop_without_its_entries_is_bad_input(tmp_path):
     with pytest.raises(BadInput, match="closeloop.json is damaged"):
         write_report(read_run(tmp_path), tmp_path / "page.html")
     assert not (tmp_path / "page.html").exists()
+
+
+def test_the_page_of_a_twin_says_how_far_its_levels_are_off_and_shows_its_law(run_folder, tmp_path):
+    run = read_run(run_folder)
+    law = [{"links": "LoS", "parameter": "path-loss exponent", "value": 2.1, "low": 1.9, "high": 2.3, "unit": ""}]
+    errors = [{"model": name, "rmse_db": rmse_db, "by": "flight", "as_good": True}
+              for name, rmse_db in (("log_distance", 4.06), ("kriging", 5.0))]
+    run.twin.provenance.update(law=law, held_out=errors)
+    write_report(run, tmp_path / "page.html")
+    page = (tmp_path / "page.html").read_text()
+    assert "held out by flight, is 4.1 dB (kriging 5.0 dB)." in page
+    assert "Law of the channel" in page and "<td>1.90</td><td>2.30</td>" in page
