@@ -40,7 +40,7 @@ from radiotwin.coverage.transmitters import (
     Transmitter,
     scene_transmitters,
     select,
-    with_defaults,
+    with_powers,
 )
 from radiotwin.errors import BadInput
 from radiotwin.geo import origin_attributes
@@ -171,16 +171,16 @@ def _transmitters(source: Twin | RadioMap | str, scene: Scene,
                                "--devices, or give a twin or a scene")
     if given is not None:
         found = _moved_outdoors(found, scene)
-    tx_power_dbm = settings.tx_power_dbm
+    found = [replace(each, load=settings.load if each.load is None else each.load,
+                     frequency_hz=each.frequency_hz or scene.config.radio.frequency_hz)
+             for each in found]
     if isinstance(source, Twin) and not source.has_gains:
-        if tx_power_dbm is not None:
+        if settings.tx_power_dbm is not None:
             raise BadInput("the twin's levels are received powers, with transmit powers in them "
                            "that nobody declared; leave --tx-power-dbm out, or declare "
                            "tx_power_dbm in devices.csv and fit again")
-        return [replace(each, load=settings.load if each.load is None else each.load,
-                        frequency_hz=each.frequency_hz or scene.config.radio.frequency_hz)
-                for each in found]
-    return with_defaults(found, scene, tx_power_dbm, settings.load)
+        return found
+    return with_powers(found, scene, settings.tx_power_dbm)
 
 
 def _moved_outdoors(transmitters: list[Transmitter], scene: Scene) -> list[Transmitter]:

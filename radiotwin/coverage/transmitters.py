@@ -123,15 +123,14 @@ def select(transmitters: list[Transmitter], names: list[str] | None) -> list[Tra
     return [known[name] for name in dict.fromkeys(names)]
 
 
-def with_defaults(transmitters: list[Transmitter], scene: Scene, tx_power_dbm: float | None,
-                  load: float) -> list[Transmitter]:
-    """Fill in transmit power, load and frequency of transmitters that do not declare them.
+def with_powers(transmitters: list[Transmitter], scene: Scene,
+                tx_power_dbm: float | None) -> list[Transmitter]:
+    """Fill in the transmit power of transmitters that do not declare it.
 
     Args:
         transmitters: to complete.
-        scene: has the default frequency, and the transmit power if `tx_power_dbm` is None.
+        scene: declares the transmit power if `tx_power_dbm` is None.
         tx_power_dbm: default transmit power [dBm].
-        load: default load.
 
     Raises:
         BadInput: a transmit power that neither transmitter, scene nor `tx_power_dbm` declares.
@@ -149,9 +148,7 @@ def with_defaults(transmitters: list[Transmitter], scene: Scene, tx_power_dbm: f
             f"{scene.folder / 'scene.toml'} has the default tx_power_dbm = "
             f"{radio.tx_power_dbm:g}; give --tx-power-dbm, or a table --transmitters with the "
             "column tx_power_dbm")
-    return [replace(each, tx_power_dbm=tx_power_dbm if each.tx_power_dbm is None
-                    else each.tx_power_dbm, load=load if each.load is None else each.load,
-                    frequency_hz=each.frequency_hz or radio.frequency_hz)
+    return [replace(each, tx_power_dbm=tx_power_dbm) if each.tx_power_dbm is None else each
             for each in transmitters]
 
 

@@ -1,11 +1,12 @@
 import numpy as np
 import pytest
 
+from radiotwin.coverage import CoverageSettings, predict_coverage
 from radiotwin.coverage.transmitters import (
     read_transmitters,
     scene_transmitters,
     select,
-    with_defaults,
+    with_powers,
 )
 from radiotwin.errors import BadInput
 from radiotwin.geo import to_geographic, to_local, write_frame
@@ -37,9 +38,10 @@ def test_every_column_is_read(scene, tmp_path):
     assert first.antenna.azimuth_deg == 120 and first.antenna.tilt_deg == -6
     assert first.antenna.pattern.peak_dbi == pytest.approx(10.0)
     assert second.antenna is second.tx_power_dbm is second.load is second.frequency_hz is None
-    whole = with_defaults([first, second], scene, 20.0, 0.7)
+    settings = CoverageSettings(tx_power_dbm=20.0, load=0.7, step_m=100.0)
+    whole = predict_coverage("al_hourani_urban", scene, [first, second], settings).transmitters
     assert [(each.tx_power_dbm, each.load, each.frequency_hz) for each in whole] == [(43, 0.5, 2.1e9), (20, 0.7, 2e9)]
-    assert with_defaults([second], scene, None, 1.0)[0].tx_power_dbm == 30.0  # the scene's
+    assert with_powers([second], scene, None)[0].tx_power_dbm == 30.0  # the scene's
 
 
 def test_positions_on_the_globe(scene, tmp_path):
