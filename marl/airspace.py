@@ -1,4 +1,4 @@
-"""Where no UAV may be: in areas that are forbidden, and near buildings."""
+"""Airspace closed to UAVs: no-fly areas, and the surroundings of buildings."""
 
 from collections.abc import Sequence
 
@@ -9,20 +9,21 @@ from shapely.geometry.base import BaseGeometry
 
 from radiotwin.scene import Scene
 
-LAYERS = 4  # of the clearance below an altitude
-LOWEST_M = 0.5  # above the ground, which is no building
-STEP_M = 3.0  # about, between the points at which buildings are looked for
+LAYERS = 4  # horizontal sections within the clearance below an altitude
+LOWEST_M = 0.5  # lowest section above ground, so that terrain is no building [m]
+STEP_M = 3.0  # approximate spacing of the points that are tested for buildings [m]
 
 
 def keep_out(scene: Scene, areas: Sequence[BaseGeometry], clearance_m: float) -> np.ndarray:
-    """Return where (nz, ny, nx) of a scene's lattice no UAV may be, besides inside buildings.
+    """Return the mask (nz, ny, nx) of lattice positions that are closed to UAVs.
 
-    A move goes half a step beyond a position, so all of that is looked at.
+    A position is closed if any part of its cell is; the insides of buildings are added by the
+    mission.
 
     Args:
-        scene: its lattice and its buildings.
+        scene: scene with lattice and buildings.
         areas: no-fly areas in the local frame, at all heights.
-        clearance_m: distance that UAVs keep from buildings, beside and below them [m].
+        clearance_m: distance to keep from buildings, sideways and above them [m].
     """
     lattice = scene.lattice
     blocked = np.zeros(lattice.shape, dtype=bool)  # a mission adds the insides of buildings
@@ -37,10 +38,9 @@ def keep_out(scene: Scene, areas: Sequence[BaseGeometry], clearance_m: float) ->
 
 
 def _near_buildings(scene: Scene, clearance_m: float) -> np.ndarray:
-    """Return the lattice positions (nz, ny, nx) whose moves come too near to a building.
+    """Return the mask (nz, ny, nx) of lattice positions whose moves violate the clearance [m].
 
-    Sections of the city, at each altitude and below it, on a finer grid with the lattice's
-    positions in it.
+    Horizontal sections of the city, at each altitude and below it, are tested on a finer grid.
     """
     lattice = scene.lattice
     parts = max(2 * round(lattice.step_m / (2 * STEP_M)), 2)  # of a step; even, for its middle
@@ -54,9 +54,9 @@ def _near_buildings(scene: Scene, clearance_m: float) -> np.ndarray:
         ground_m = np.asarray(scene.city.ground_height_m(grid_x_m, grid_y_m))
     near = np.zeros(lattice.shape, dtype=bool)
     below_m = clearance_m * np.arange(LAYERS + 1) / LAYERS
-    # Each section counts as far as the one above it, so that nothing between them is missed.
+    # Each section uses the reach of the section above it, so that nothing in between is missed.
     beside_m = np.sqrt(clearance_m**2 - np.append(0.0, below_m[:-1])**2)
-    here = slice(margin, -margin, parts)
+    lattice_points = slice(margin, -margin, parts)
     for level, altitude_m in enumerate(lattice.z_m):
         for down_m, reach_m in zip(below_m, beside_m, strict=True):
             height_m = max(altitude_m - down_m, LOWEST_M)
@@ -67,5 +67,5 @@ def _near_buildings(scene: Scene, clearance_m: float) -> np.ndarray:
                 away_m = distance_transform_edt(~inside, step_m)
                 along_moves_m = np.minimum(minimum_filter1d(away_m, parts + 1, axis=0),
                                            minimum_filter1d(away_m, parts + 1, axis=1))
-                near[level] |= along_moves_m[here, here] <= reach_m
+                near[level] |= along_moves_m[lattice_points, lattice_points] <= reach_m
     return near

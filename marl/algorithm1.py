@@ -1,4 +1,4 @@
-"""Algorithm 1 of the paper: fly, learn the twin from the measurements, train in it, and repeat."""
+"""Algorithm 1 of the paper: fly, fit the twin to the measurements, train in it, and repeat."""
 
 import time
 from collections.abc import Callable, Collection
@@ -39,12 +39,12 @@ TWINS = {"nn": "segmented_nn", "log-distance": "log_distance", "kriging": "krigi
          "paths": "paths", "path_kriging": "path_kriging"}
 """Name of a twin on the command line -> model of `fit_twin`."""
 FLIGHTS = ("measuring_flights", "training_flights", "selection_flights")
-"""Columns of the log: real flights by what they were for."""
+"""Columns of the log: numbers of real flights by purpose."""
 COUNTS = ("round", "real_episodes", *FLIGHTS, "simulated_episodes", "located", "evaluation_flights")
 NUMBERS = ("real_ratio", "truth_ratio", "truth_ratio_std", "twin_ratio", "location_error_median_m",
            "location_error_worst_m", "learn_twin_s", "round_s")
-"""Columns of the log, of which `Campaign.log` writes rows."""
-MAX_NUMBER = 1e30  # in it
+"""Further columns of the log, see `Campaign.log`."""
+MAX_NUMBER = 1e30  # largest number that is accepted in a log
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,11 +52,11 @@ class Outcome:
     """Result of a run.
 
     Attributes:
-        rows: one for every round; the columns are explained in `docs/marl.md`.
-        blocks: records of training, several a round.
-        flights: the evaluation in the truth at the end.
-        known: positions that the UAVs knew in it.
-        twin: the last one; None where none was needed.
+        rows: log with a row for each round; `docs/marl.md` explains the columns.
+        blocks: records of training, several for each round.
+        flights: final evaluation in the truth.
+        known: device positions that the UAVs knew in it.
+        twin: the last twin; None if training was in the truth.
     """
 
     rows: list[dict]
@@ -73,16 +73,15 @@ def run_algorithm(run: RunSettings, learner_settings: LearnerSettings, scene: Sc
                   on_learned: Callable[["Campaign", Mission], None] | None = None) -> Outcome:
     """Alternate real flights and training in the twin.
 
-    With a perfect twin (`run.twin == "truth"`) nothing needs to be measured: every training
-    episode is a real one.
+    With a perfect twin (`run.twin == "truth"`) nothing is measured: training episodes are real.
 
     Args:
         run: settings of the run.
         learner_settings: settings of learning.
-        scene: the true positions of its unknown devices are not used unless `run` says so.
-        truth: map of the real world.
-        folder: for the checkpoint, written after every round; None for none.
-        resume: go on from the checkpoint.
+        scene: scene; true positions of unknown devices are used only if `run` says so.
+        truth: radio map of the real world.
+        folder: folder of the checkpoint, written after every round; None: no checkpoint.
+        resume: whether to continue from the checkpoint.
         on_round: called after every round with all rows and blocks so far.
         on_progress: called with the number of episodes simulated since the last call, and with a
             text about the last round.
@@ -90,7 +89,7 @@ def run_algorithm(run: RunSettings, learner_settings: LearnerSettings, scene: Sc
         on_learned: called in every round with the campaign and the mission to train in.
 
     Returns:
-        The same to the bit, whether it was interrupted or not (on the CPU).
+        the result; on the CPU it is the same to the bit if the run was interrupted and resumed.
 
     Raises:
         BadInput: a damaged checkpoint, or input that `fit_twin` or `make_mission` refuses.
@@ -106,11 +105,8 @@ def run_algorithm(run: RunSettings, learner_settings: LearnerSettings, scene: Sc
             if campaign.twin is not None:
                 campaign.twin.save(folder / "twin")
             on_progress(run.episodes * len(rows), _summary(rows[-1], run))
-            # The run may have been stopped between the checkpoint and the log.
+            # The run may have stopped between checkpoint and log, so the log is written again.
             on_round(rows, blocks)
-            if not learner.state(True):  # it needs no checkpoint: it is made of the twin
-                campaign.tell(learner)
-                learner.prepare(campaign.mission(), on_progress)
         for number in range(len(rows), run.real_episodes):
             started = time.perf_counter()
             rng = stream(run.seed, "decisions", number)
@@ -139,10 +135,10 @@ def run_algorithm(run: RunSettings, learner_settings: LearnerSettings, scene: Sc
 
 
 def resumed(campaign: "Campaign", learner: Learner, path: Path) -> list[dict]:
-    """Have a campaign and its learner go on from a checkpoint, and return the log's blocks.
+    """Restore a campaign and its learner from a checkpoint; return the records of training.
 
     Raises:
-        BadInput: it is damaged, or not of this run.
+        BadInput: the checkpoint is damaged, or of another run.
     """
     state = load_checkpoint(path)
     with refusing(path):
@@ -150,23 +146,27 @@ def resumed(campaign: "Campaign", learner: Learner, path: Path) -> list[dict]:
         if not campaign.rows:
             raise Damaged("no round has finished")
         learner.load_state(state["strategy"])
-        return require_log(state["blocks"], ("round", "episodes"))
+        blocks = require_log(state["blocks"], ("round", "episodes"))
+    if not state["strategy"]:  # a learner without a state of its own is prepared from the twin
+        campaign.tell(learner)
+        learner.prepare(campaign.mission(), lambda _: None)
+    return blocks
 
 
 class Campaign:
-    """Real flights of one owner, the twin that is learned from them, and the log of the rounds.
+    """Real flights, the twin fitted to their measurements, and the log of the rounds.
 
     Args:
         run: settings of the run.
-        scene: the true positions of its unknown devices are not used unless `run` says so.
-        truth: map of the real world; None: there is none, and flights were flown.
-        measured: on flights that were flown; None: they are simulated in the truth.
+        scene: scene; true positions of unknown devices are used only if `run` says so.
+        truth: radio map of the real world; None: there are only `measured` flights.
+        measured: measurements of flights; None: flights are simulated in the truth.
 
     Attributes:
-        known: positions that the UAVs know.
-        twin: the present one; None where none was needed so far.
-        rows: of the log, one for every round; `docs/marl.md` explains the columns.
-        learn_s: time that learning the present twin took [s].
+        known: device positions that the UAVs know.
+        twin: the present twin; None before the first, or if training is in the truth.
+        rows: log with a row for each round; `docs/marl.md` explains the columns.
+        learn_s: duration of the last fit of a twin [s].
     """
 
     def __init__(self, run: RunSettings, scene: Scene, truth: RadioMap | None,
@@ -176,7 +176,7 @@ class Campaign:
         self.twin: Twin | None = None
         self.reality: Reality | None = None
         if truth is not None:
-            # The shadowing of a truth includes the receivers' noise.
+            # In a truth with shadowing, that includes the receivers' noise.
             noise_db = 0.0 if "sigma_db" in truth.dataset else run.noise_db
             self.reality = Reality(scene, truth, run.assignment, noise_db, run.seed)
         self._true_positions = run.twin == "truth" or run.privileged
@@ -185,22 +185,22 @@ class Campaign:
 
     @property
     def flown(self) -> int:
-        """Number of real flights that were simulated."""
+        """Number of simulated real flights."""
         return len(self.reality.tables) if self.reality is not None else 0
 
     def in_truth(self) -> Mission:
-        """Return the mission in the truth, which there must be."""
+        """Return the mission in the truth's map."""
         assert self.reality is not None
         return self.reality.mission(self.known)
 
     def mission(self) -> Mission:
-        """Return the mission to train in: in the twin, or in the truth where there is no twin."""
+        """Return the mission to train in: in the twin's map, or in the truth's without a twin."""
         if self.twin is None:
             return self.in_truth()
         return twin_mission(self.scene, self.run, self.twin, self.known)
 
     def tell(self, learner: Learner) -> None:
-        """Tell a learner that asks for it what the twin leaves open."""
+        """Pass the twin's uncertainty to a learner that uses it (`Learner.believes`)."""
         if not learner.believes:
             return
         prior = None
@@ -210,14 +210,13 @@ class Campaign:
         learner.believe(prior)
 
     def learn(self, learner: Learner | None, rng: np.random.Generator) -> None:
-        """Fly a real episode, and learn the twin anew from all measurements.
+        """Fly a real episode, and fit the twin to all measurements so far.
 
-        Flights that were flown are learned from once. With a perfect twin there is nothing to
-        learn.
+        Given measurements are fitted once. With a perfect twin nothing is done.
 
         Args:
-            learner: may fly; None: flights were flown.
-            rng: of the decisions.
+            learner: learner whose policy may fly; None if measurements were given.
+            rng: generator of the policy's decisions.
         """
         run, started = self.run, time.perf_counter()
         if run.twin == "truth" or (self.measured is not None and self.twin is not None):
@@ -232,13 +231,13 @@ class Campaign:
 
     def log(self, learner: Learner, mission: Mission, rng: np.random.Generator,
             simulated: int) -> None:
-        """Evaluate the policy in the twin and in the truth, as far as they are there.
+        """Evaluate the policy in the twin and in the truth, if there are, and add a row to the log.
 
         Args:
-            learner: that has been prepared.
-            mission: that it was prepared in.
-            rng: of its policy.
-            simulated: episodes so far, of all replicas.
+            learner: learner that was prepared in this round.
+            mission: mission in which it was prepared.
+            rng: generator of the policy's decisions.
+            simulated: training episodes of all replicas so far.
         """
         run, found, in_twin, real = self.run, self.known, np.full(1, np.nan), np.full(1, np.nan)
         if self.twin is not None:
@@ -263,10 +262,10 @@ class Campaign:
             "round_s": 0.0})
 
     def _real_flights(self, learner: Learner, simulated: int) -> dict[str, float]:
-        """Return the real flights so far by what they were for, and the mean share of them all.
+        """Return the numbers of real flights by purpose, and the mean share that they collected.
 
-        In a perfect twin those that train and those that choose between policies are real. The
-        share is NaN where somebody else flew, or a learner does not say what it collected.
+        With a perfect twin, flights of training and of selection are real. The share is NaN for
+        given measurements, and if the learner does not count what it collected.
         """
         if self.run.twin == "truth":
             counts = 0, simulated, learner.selection.flights
@@ -283,19 +282,19 @@ class Campaign:
                 "real_ratio": float(collected / total) if total else np.nan}
 
     def state(self, folder: Path) -> dict:
-        """Return what a checkpoint has of it, and write the twin into the run's folder."""
+        """Return the state for a checkpoint, and write the twin into the run's folder."""
         tables, ratios = ([], []) if self.reality is None else (self.reality.tables,
                                                                 self.reality.ratios)
         return {"rows": self.rows, "tables": tables, "ratios": ratios,
                 "twin": None if self.twin is None else keep_twin(self.twin, folder)}
 
     def load_state(self, state: dict, path: Path, others: Collection[str]) -> None:
-        """Go on from a checkpoint, a stranger's; raise Damaged if it is not of this campaign.
+        """Restore the campaign from a checkpoint; raise Damaged if it is not of this campaign.
 
         Args:
-            state: see there, with parts that the caller checks.
-            path: of the checkpoint.
-            others: names of those parts.
+            state: content of the checkpoint, which may come from a stranger.
+            path: path of the checkpoint.
+            others: names of the parts that the caller checks.
         """
         require(state, dict.fromkeys(("rows", "tables", "ratios", "twin", *others), ...))
         run, tables, ratios = self.run, state["tables"], [float(each) for each in state["ratios"]]
@@ -314,12 +313,14 @@ class Campaign:
             self._see(stored_twin(state["twin"], path, self.scene))
 
     def _measurements(self) -> Measurements:
+        """Return the given measurements, or those of the simulated flights so far."""
         if self.measured is not None:
             return self.measured
         assert self.reality is not None
         return self.reality.measurements()
 
     def _see(self, twin: Twin) -> None:
+        """Set the twin, and the device positions that the UAVs know by it."""
         self.twin = twin
         if not self._true_positions:
             self.known = Known.of(twin.devices)
@@ -327,16 +328,16 @@ class Campaign:
 
 @dataclass
 class Reality:
-    """Real flights, and what was measured on them.
+    """Simulated real flights and their measurements.
 
-    Args:
-        scene: its anchors are known, its unknown devices are not.
-        truth: radio map that decides what UAVs receive.
+    Attributes:
+        scene: scene with the true positions.
+        truth: radio map of the real world.
         assignment: see `make_mission`.
         noise_db: standard deviation of the receivers' measurement error [dB].
-        seed: of shadowing and noise.
-        tables: measurements so far, one table for each flight.
-        ratios: share of all data that each of them collected.
+        seed: random seed of shadowing and noise.
+        tables: table of measurements of each flight.
+        ratios: share of all data that each flight collected.
     """
 
     scene: Scene
@@ -348,11 +349,11 @@ class Reality:
     ratios: list[float] = field(default_factory=list)
 
     def mission(self, known: Known) -> Mission:
-        """Return the mission in the truth, for UAVs that know these positions."""
+        """Return the mission in the truth's map, for UAVs that know these positions."""
         return make_mission(self.scene, self.truth, known, self.assignment)
 
     def fly(self, policy: Policy, known: Known) -> Flights:
-        """Fly one real episode and keep the measurements of every device in every slot."""
+        """Simulate one real flight, and store the readings of every device in every slot."""
         mission = self.mission(known)
         number = len(self.tables)
         rng = stream(self.seed, "real flight", number)
@@ -362,11 +363,12 @@ class Reality:
         return flights
 
     def measurements(self) -> Measurements:
-        """Return all measurements so far."""
+        """Return the measurements of all flights so far."""
         return Measurements(pd.concat(self.tables, ignore_index=True),
                             declared_devices(self.scene))
 
     def _measured(self, flights: Flights, name: str, rng: np.random.Generator) -> pd.DataFrame:
+        """Return the readings of a flight as a table, with noise, blank below the limit."""
         config, lattice = self.scene.config, self.scene.lattice
         slots, frames = int(flights.length[0]), flights.frames
         before = len(self.tables) * flights.action.shape[1]
@@ -388,13 +390,13 @@ class Reality:
 
 
 def twin_mission(scene: Scene, run: RunSettings, twin: Twin, known: Known) -> Mission:
-    """Return the mission in a twin.
+    """Return the mission in a twin's map.
 
     Args:
-        scene: of the twin.
-        run: settings of the run; `twin_shadowing` says how long errors of the map last.
-        twin: it gives the map.
-        known: positions that the UAVs know.
+        scene: scene of the twin.
+        run: settings of the run; `twin_shadowing` tells how long errors of the map last.
+        twin: the twin.
+        known: device positions that the UAVs know.
     """
     radio_map = twin.radio_map(scene)
     if run.twin_shadowing == "fitted":
@@ -403,28 +405,25 @@ def twin_mission(scene: Scene, run: RunSettings, twin: Twin, known: Known) -> Mi
 
 
 def location_errors_m(scene: Scene, known: Known) -> np.ndarray:
-    """Return the distance of each unknown device's estimate from its true position [m].
-
-    NaN where there is no estimate.
-    """
-    nowhere = np.nan, np.nan
+    """Return the horizontal error of each unknown device's estimate [m]; NaN without one."""
+    missing = np.nan, np.nan
     return np.array([
-        np.hypot(*np.subtract(known.position_m.get(d.device, nowhere), (d.x_m, d.y_m)))
+        np.hypot(*np.subtract(known.position_m.get(d.device, missing), (d.x_m, d.y_m)))
         for d in scene.config.devices if d.role == "unknown"])
 
 
 def measuring_policy(run: RunSettings, reality: Reality, twin: Twin | None, known: Known,
                      learner: Learner, rng: np.random.Generator) -> Policy:
-    """Return the policy of the next real episode."""
-    how = run.measure if twin is not None else run.first_flight
-    if how == "waypoints":
+    """Return the policy of the next real flight: between random cells, random, or the learner's."""
+    kind = run.measure if twin is not None else run.first_flight
+    if kind == "waypoints":
         return PlanPolicy(waypoint_actions(reality.scene, reality.mission(known), rng))
     return HeuristicPolicy("random", rng) if twin is None else learner.policy(rng)
 
 
 def _summary(row: dict, run: RunSettings) -> str:
-    """Return a short text about a round, for the progress bar."""
-    where = ""
+    """Return a short text about a round for the progress bar."""
+    accuracy = ""
     if run.twin != "truth":
-        where = f", devices found to {row['location_error_median_m']:.1f} m"
-    return f"round {row['round']}/{run.real_episodes}: {row['truth_ratio']:.3f} collected{where}"
+        accuracy = f", devices found to {row['location_error_median_m']:.1f} m"
+    return f"round {row['round']}/{run.real_episodes}: {row['truth_ratio']:.3f} collected{accuracy}"

@@ -1,12 +1,11 @@
-"""What UAVs believe of the devices, and how they learn from what they hear and do not hear.
+"""Bayesian filter of device positions and map errors, updated by received and missing SNRs.
 
-A device is believed to be at one of N candidate positions (particles), each with a map of its own.
-At each of them an error of its level, the same everywhere, and an error of the map, correlated
-along the flight of a UAV (Gudmundson 1991, Electronics Letters 27), are estimated by a Kalman
-filter; so a wrong map costs a candidate one error for every correlation length, not one for every
-slot, and readings in a row do not make the belief surer than they may. A reading below the limit
-of detection enters as censored: by the probability of it, and the moments of the truncated normal
-distribution. A device that does not transmit is one more candidate, which explains silence.
+Each device has N candidate positions (particles) with a map each. For each candidate a Kalman
+filter estimates two errors: one of the device's level, the same everywhere, and one of the map,
+correlated along the flight of a UAV (Gudmundson 1991, Electronics Letters 27). So consecutive
+readings do not count as independent. A reading below the limit of detection is censored: it enters
+by its probability and the moments of the truncated normal distribution. One more candidate is a
+device that does not transmit.
 """
 
 import math
@@ -18,13 +17,13 @@ from marl.mission import Mission
 from marl.planner import expected_data
 from radiotwin.runtime.compiled import njit
 
-NOISE_DB = 1.0  # of a reading, besides the error of the map
-# Power of the likelihood of a position: what the map has wrong is wrong in many slots (Holmes and
-# Walker 2017, Biometrika 104).
+NOISE_DB = 1.0  # standard deviation of a reading's noise [dB]
+# Exponent of the likelihood of a position, since errors of the map persist over many slots (Holmes
+# and Walker 2017, Biometrika 104).
 TEMPER = 0.3
-TAIL = 4.0  # degrees of freedom of the readings' distribution: a few are far off
-NEGLIGIBLE = 1e-3  # probability of a candidate that no plan depends on
-# Of the table of the data expected in a slot: mean SNR and its standard deviation [dB].
+TAIL = 4.0  # degrees of freedom of readings (Student's t)
+NEGLIGIBLE = 1e-3  # less probable candidates are left out of the expected data
+# Grid of the table of expected data: mean SNR and its standard deviation [dB].
 _MEANS_DB, _SDS_DB = np.arange(-60.0, 120.5, 0.5), np.arange(0.0, 40.5, 0.5)
 
 
@@ -33,14 +32,14 @@ class Prior(NamedTuple):
 
     Attributes:
         snr_db: (K, N, L, ny, nx) float32 mean SNR of each candidate [dB]; -inf: never received.
-        sd_db: (K, N, L, ny, nx) float32 standard deviation of its error [dB].
-        weight: (K, N) probability of each candidate, of a device that transmits; sums to 1.
-        level_sd_db: (K,) standard deviation of the error of a device's own level [dB].
-        common_sd_db: of the error that is common to all devices [dB].
+        sd_db: (K, N, L, ny, nx) float32 standard deviation of the map's error [dB].
+        weight: (K, N) probability of each candidate, given that the device transmits.
+        level_sd_db: (K,) standard deviation of the error of each device's level [dB].
+        common_sd_db: standard deviation of the level error common to all devices [dB].
         silent: (K,) probability that a device does not transmit.
-        data_spread: of each device's data, evenly from (1 - this) to (1 + this) times the
-            mission's.
-        share, length_m: of the map's error that lasts; see `Mission.shadowing_share`.
+        data_spread: relative half-width of the uniform distribution of each device's data.
+        share, length_m: share of the map's error that lasts, and its correlation length, see
+            `Mission.shadowing_share`.
     """
 
     snr_db: np.ndarray
@@ -56,7 +55,7 @@ class Prior(NamedTuple):
     @classmethod
     def of_mission(cls, mission: Mission, level_sd_db: float = 0.0, silent: float = 0.0,
                    data_spread: float = 0.0) -> "Prior":
-        """Return the belief of UAVs that have one map alone: one candidate for each device."""
+        """Return the prior with a single candidate for each device: the mission's map."""
         devices = mission.devices
         return cls(mission.snr_db.swapaxes(0, 1)[:, None], mission.sigma_db.swapaxes(0, 1)[:, None],
                    np.ones((devices, 1)), np.full(devices, float(level_sd_db)), 0.0,
@@ -65,10 +64,12 @@ class Prior(NamedTuple):
 
 
 class _State(NamedTuple):
-    """Of the filter: (K, N) log weights, (K, N, 1 + U) means of the errors, and covariances.
+    """State of the filter for K devices, N candidates and U UAVs.
 
-    The first error is that of the level [dB]; the others are those of the map where each UAV is, in
-    standard deviations.
+    Attributes:
+        log_weight: (K, N) log weights of the candidates.
+        mean: (K, N, 1 + U) means of the level error [dB] and of the map error at each UAV [sd].
+        covariance: (K, N, 1 + U, 1 + U) their covariances.
     """
 
     log_weight: np.ndarray
@@ -77,11 +78,11 @@ class _State(NamedTuple):
 
 
 class Belief:
-    """Belief of one UAV, or of UAVs that share what they hear, in one flight.
+    """Belief of one UAV, or of UAVs that share readings, during one flight.
 
     Args:
-        prior: before take-off.
-        mission: of the flight, as it is believed.
+        prior: prior before take-off.
+        mission: the mission as the UAVs assume it.
     """
 
     def __init__(self, prior: Prior, mission: Mission) -> None:
@@ -96,16 +97,16 @@ class Belief:
             self._state = _State(np.log(prior.weight), np.zeros((devices, candidates, errors)),
                                  covariance)
         self._heard = np.zeros(devices, dtype=bool)
-        self._cell = mission.start.copy()  # where each UAV listened last
+        self._cell = mission.start.copy()  # cell of each UAV's last readings
         self._table = _expected_table(mission)
 
     def hear(self, uav: int, cell: np.ndarray, snr_db: np.ndarray) -> None:
-        """Learn from what a UAV hears of all devices in a slot.
+        """Update the belief by a UAV's readings of all devices in a slot.
 
         Args:
-            uav: its number.
-            cell: (2,) row and column.
-            snr_db: (K,) [dB]; -inf where a device is not detected.
+            uav: number of the UAV.
+            cell: (2,) row and column of the UAV.
+            snr_db: (K,) SNR [dB]; -inf if a device is not detected.
         """
         moved_m = self._mission.step_m * float(np.hypot(*(cell - self._cell[uav])))
         kept = math.exp(-moved_m / self.prior.length_m)
@@ -116,7 +117,7 @@ class Belief:
 
     @property
     def silent(self) -> np.ndarray:
-        """(K,) probability that a device does not transmit."""
+        """(K,) posterior probability that a device does not transmit; 0 once it was heard."""
         top = self._state.log_weight.max(axis=1)
         evidence = np.exp(top) * np.exp(self._state.log_weight - top[:, None]).sum(axis=1)
         prior = self.prior.silent
@@ -125,14 +126,14 @@ class Belief:
 
     @property
     def weight(self) -> np.ndarray:
-        """(K, N) probabilities of the candidates, of devices that transmit."""
+        """(K, N) posterior probability of each candidate, given that the device transmits."""
         weight = np.exp(self._state.log_weight - self._state.log_weight.max(axis=1, keepdims=True))
         return weight / weight.sum(axis=1, keepdims=True)
 
     def expected_data(self) -> np.ndarray:
-        """Return the data units (U, K, ny, nx) that a slot on each link is expected to bring.
+        """Return the expected data units (U, K, ny, nx) of a slot on each link.
 
-        Of a device that transmits.
+        It is given that the device transmits.
         """
         prior = self.prior
         mission = self._mission
@@ -143,7 +144,7 @@ class Belief:
 
 
 def _expected_table(mission: Mission) -> np.ndarray:
-    """Return `expected_data` of links with each mean and standard deviation of the grid."""
+    """Return `expected_data` for each mean SNR and standard deviation of the grid."""
     mean_db, sd_db = (grid.astype(np.float32)[None, None] for grid in np.meshgrid(
         _MEANS_DB, _SDS_DB, indexing="ij"))
     return expected_data(mission._replace(snr_db=mean_db, sigma_db=sd_db))[0, 0]
@@ -152,7 +153,19 @@ def _expected_table(mission: Mission) -> np.ndarray:
 @njit(cache=True, nogil=True, error_model="numpy")
 def _hear(prior: Prior, state: _State, uav: int, level: int, row: int, column: int, kept: float,
           snr_db: np.ndarray, limit_db: float) -> None:
-    """Update the state with a UAV's readings (K,); `kept`: correlation since its last ones."""
+    """Update the filter by a UAV's readings (K,).
+
+    Args:
+        prior: prior of the belief.
+        state: state of the filter; changed.
+        uav: number of the UAV.
+        level: level of its map.
+        row: row of its cell.
+        column: column of its cell.
+        kept: correlation of the map's error with that at its last cell.
+        snr_db: (K,) readings; -inf = not detected.
+        limit_db: limit of detection [dB].
+    """
     devices, candidates, errors = state.mean.shape
     at, lasting = uav + 1, math.sqrt(prior.share)
     gain = np.empty(errors)
@@ -189,7 +202,7 @@ def _hear(prior: Prior, state: _State, uav: int, level: int, row: int, column: i
                 square = off_db * off_db / spread
                 state.log_weight[k, i] -= 0.5 * TEMPER * (
                     math.log(spread) + (TAIL + 1.0) * math.log1p(square / TAIL))
-                # A reading that is far off says less of the errors.
+                # Outliers update the errors less (Student's t as a scale mixture).
                 spread *= max((TAIL + square) / (TAIL + 1.0), 1.0)
                 shift, shrink = off_db / spread, 1.0 / spread
             for j in range(errors):
@@ -201,7 +214,7 @@ def _hear(prior: Prior, state: _State, uav: int, level: int, row: int, column: i
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _below(depth: float) -> tuple[float, float]:
-    """Return the logarithm of a normal distribution below a depth, and density over it there."""
+    """Return log Φ(depth) and φ(depth) / Φ(depth) of the standard normal distribution."""
     if depth < -8.0:  # the series of Mills's ratio
         log_tail = -0.5 * depth * depth - math.log(-depth) - 0.9189385332046727
         return log_tail, -depth - 1.0 / depth
@@ -212,7 +225,7 @@ def _below(depth: float) -> tuple[float, float]:
 @njit(cache=True, nogil=True, error_model="numpy")
 def _value(prior: Prior, state: _State, weight: np.ndarray, levels: np.ndarray, cell: np.ndarray,
            step_m: float, table: np.ndarray, value: np.ndarray) -> None:
-    """Add the data (U, K, ny, nx) that a slot is expected to bring, over all candidates."""
+    """Add the expected data of a slot, averaged over all candidates, to `value` (U, K, ny, nx)."""
     uavs, devices, rows, columns = value.shape
     lasting = math.sqrt(prior.share)
     near = np.zeros((rows, columns))
@@ -243,7 +256,7 @@ def _value(prior: Prior, state: _State, weight: np.ndarray, levels: np.ndarray, 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _looked_up(table: np.ndarray, snr_db: float, sd_db: float) -> float:
-    """Return the data expected in a slot, between the entries of its table."""
+    """Interpolate the table of expected data bilinearly."""
     x = min(max((snr_db + 60.0) * 2.0, 0.0), table.shape[0] - 1.000001)
     y = min(max(sd_db * 2.0, 0.0), table.shape[1] - 1.000001)
     a, b = int(x), int(y)

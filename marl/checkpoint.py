@@ -1,10 +1,10 @@
-"""Checkpoints: written whole or not at all, and read without executing anything in them.
+"""Write checkpoints atomically; read and validate them without executing anything in them.
 
-The format is that of safetensors: arrays, and a JSON document that refers to them. A key that
-begins with `$` marks what JSON has no form for.
+The format is safetensors: arrays, and a JSON document that refers to them. Keys that begin with
+`$` mark types that JSON lacks.
 
-A checkpoint may be a stranger's: all that a run resumes from is held against a form, that of what
-this run would have written, before it is used. Compiled code checks no index.
+A checkpoint may come from a stranger. Before use, each part is compared with the form that this run
+would have written, since compiled code does not check indices.
 """
 
 import json
@@ -33,17 +33,17 @@ from radiotwin.scene import Scene
 from radiotwin.twin import Twin
 
 NAME = "checkpoint.safetensors"
-FORMAT = 6
+FORMAT = 7
 _KEY = "checkpoint"
-_MAX_NAME = 100  # characters of what a learner logs
+_MAX_NAME = 100  # longest name of a logged value [characters]
 
 
 class Damaged(ValueError):
-    """A checkpoint holds something else than this run would have written."""
+    """A checkpoint differs in form from what this run would have written."""
 
 
 def save_checkpoint(state: dict, path: Path) -> None:
-    """Write dicts and lists of numbers, texts, arrays, tensors and tables; all keys are texts."""
+    """Write nested dicts and lists of numbers, texts, arrays, tensors and tables to a file."""
     arrays: dict[str, np.ndarray] = {}
     text = json.dumps({"format": FORMAT, "state": _packed(state, arrays)}, allow_nan=False)
     with atomic_file(path) as file:
@@ -51,10 +51,10 @@ def save_checkpoint(state: dict, path: Path) -> None:
 
 
 def load_checkpoint(path: Path) -> dict:
-    """Return what `save_checkpoint` was given; what it means is for the reader to check.
+    """Read the state written by `save_checkpoint`; the caller validates its content (`require`).
 
     Raises:
-        BadInput: it is damaged, or of another version.
+        BadInput: the file is damaged, or of another version.
     """
     arrays, text = parse_arrays(read_bytes(path, "checkpoint", CHECKPOINT_BYTES), _KEY, path)
     content = parse_json(text, path)
@@ -71,7 +71,7 @@ def load_checkpoint(path: Path) -> dict:
 
 @contextmanager
 def refusing(path: Path) -> Iterator[None]:
-    """Turn what a damaged checkpoint raises into one message, BadInput."""
+    """Convert exceptions raised by a damaged checkpoint into BadInput."""
     try:
         yield
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError,
@@ -87,7 +87,7 @@ def _is_tensor(value: Any) -> bool:
 
 
 def _packed(value: Any, arrays: dict[str, np.ndarray]) -> Any:
-    """Return a value as JSON has it, and add its arrays to `arrays`."""
+    """Convert a value for JSON, moving its arrays to `arrays`."""
     if isinstance(value, pd.DataFrame):
         columns = {str(name): column.to_numpy() if column.dtype.kind in "fiub"
                    else [str(text) for text in column] for name, column in value.items()}
@@ -112,7 +112,7 @@ def _packed(value: Any, arrays: dict[str, np.ndarray]) -> Any:
 
 
 def _unpacked(value: Any, arrays: dict[str, np.ndarray]) -> Any:
-    """Return what `_packed` was given, and take its arrays from `arrays`."""
+    """Invert `_packed`, taking arrays out of `arrays`."""
     if isinstance(value, list):
         return [_unpacked(each, arrays) for each in value]
     if not isinstance(value, dict):
@@ -132,12 +132,12 @@ def _unpacked(value: Any, arrays: dict[str, np.ndarray]) -> Any:
 
 @dataclass(frozen=True)
 class Within:
-    """Form of an array: type and shape of another one, and a range; NaN is in no range.
+    """Form of an array: type and shape of another one, and a range of values without NaN.
 
     Attributes:
         like: array of that type and shape.
         low: least value, broadcast to the shape.
-        high: greatest value, likewise.
+        high: greatest value, broadcast to the shape.
     """
 
     like: np.ndarray
@@ -152,14 +152,14 @@ GENERATOR = {"bit_generator": "PCG64", "has_uint32": range(2), "uinteger": range
 
 
 def require(value: Any, form: Any, what: str = "the state") -> Any:
-    """Return a part of a checkpoint that has a form; raise Damaged for anything else.
+    """Return a part of a checkpoint if it has a form; raise Damaged otherwise.
 
     Args:
-        value: of a stranger's file.
-        form: what it should be. A dict: these fields and no others, each of its form. A list: one
-            of each form. A range: a whole number in it. A text: this one. A tensor: a finite one
-            of its type and shape. `Within`: such an array. `...`: it is checked elsewhere.
-        what: name of the part.
+        value: part of a stranger's file.
+        form: required form. A dict: exactly these fields, each of its form. A list: one item of
+            each form. A range: a whole number in it. A text: this text. A tensor: a finite one of
+            its type and shape. `Within`: such an array. `...`: anything, checked elsewhere.
+        what: name of the part, for messages.
     """
     match form:
         case dict():
@@ -194,13 +194,13 @@ def require(value: Any, form: Any, what: str = "the state") -> Any:
 
 def require_log(records: Any, counts: Collection[str], others: Collection[str] = (),
                 largest: float = math.inf) -> list[dict]:
-    """Return records of a log; raise Damaged for anything else.
+    """Return the records of a log if they are valid; raise Damaged otherwise.
 
     Args:
-        records: name -> number, each; a learner of one's own logs what it likes.
-        counts: names of whole numbers that each has.
-        others: names of other numbers that each has.
-        largest: number; NaN is allowed.
+        records: list of dicts name -> number; further names are allowed.
+        counts: names of required whole numbers.
+        others: names of other required numbers.
+        largest: largest absolute value; NaN is allowed.
     """
     if not isinstance(records, list):
         raise Damaged("a log should be a list")
@@ -218,10 +218,7 @@ def require_log(records: Any, counts: Collection[str], others: Collection[str] =
 
 
 def require_plan(actions: Any, mission: Mission) -> np.ndarray:
-    """Return (T, U) actions that can be flown in a mission; raise Damaged for anything else.
-
-    The mission's map does not matter.
-    """
+    """Return actions (T, U) if they are feasible in a mission; raise Damaged otherwise."""
     require(actions, Within(np.zeros((mission.longest, mission.uavs), np.int8), 0,
                             ACTION_COUNT - 1), "a plan")
     possible = np.zeros(ACTION_COUNT, dtype=np.bool_)
@@ -237,7 +234,7 @@ def require_plan(actions: Any, mission: Mission) -> np.ndarray:
 
 
 def require_tables(tables: list, scene: Scene) -> list[pd.DataFrame]:
-    """Return tables of flights that a scene's UAVs can have measured; raise Damaged otherwise."""
+    """Return tables of measurements if a scene's UAVs can have made them, else raise Damaged."""
     config, lattice = scene.config, scene.lattice
     slots = [uav.battery / HOVER_COST + 1 for uav in config.uavs]
     for flight, table in enumerate(tables):
@@ -263,14 +260,14 @@ def require_tables(tables: list, scene: Scene) -> list[pd.DataFrame]:
 
 
 def keep_twin(twin: Twin, folder: Path) -> dict:
-    """Write a twin to the folder `twin` in a run's; return it as a checkpoint has it."""
+    """Write a twin to the subfolder `twin` of a run; return its entry in a checkpoint."""
     twin.save(folder / "twin")
     record, channel = twin.encode()
     return {"record": record, "channel": np.frombuffer(channel, np.uint8)}
 
 
 def stored_twin(content: Any, path: Path, scene: Scene) -> Twin:
-    """Return the twin of a checkpoint; raise Damaged if it is not of the scene's devices."""
+    """Decode the twin of a checkpoint; raise Damaged if it is not of the scene's devices."""
     if set(content) != {"record", "channel"} or not isinstance(content["record"], str):
         raise Damaged("the twin is not a text and bytes")
     channel = np.asarray(content["channel"])

@@ -1,10 +1,10 @@
-"""Many flights at once: the mission's rules, compiled, and what agents and mixer see of a slot.
+"""Environment: the mission's rules for many flights at once (compiled), and the learners' features.
 
 One slot: collect from the assigned device at the current position, then move, then draw new SNRs
 and assign devices anew. So the first position counts and the last one does not.
 
 Features are those of the paper (Sec. III-A), scaled to about one. The replay memory keeps frames,
-which take a fifth of the memory, and makes features of them again.
+which take a fifth of the memory, and computes features from them again.
 """
 
 from typing import NamedTuple
@@ -28,10 +28,10 @@ class Frame(NamedTuple):
 
     Attributes:
         cell: (E, U, 2) int16 row and column.
-        battery: (E, U) int16 left, in hovers (half battery units).
-        snr_db: (E, U, K) float32 of this slot, shadowing included; -inf where not detected.
-        data_units: (E, K) float32 left at each device.
-        assigned: (E, U) int16 device that serves the UAV in this slot; -1 for none.
+        battery: (E, U) int16 battery left [hovers = half battery units].
+        snr_db: (E, U, K) float32 SNR in this slot, with shadowing; -inf = not detected.
+        data_units: (E, K) float32 data left at each device.
+        assigned: (E, U) int16 device assigned to the UAV in this slot; -1 for none.
     """
 
     cell: np.ndarray
@@ -54,10 +54,10 @@ def empty_frame(shape: tuple[int, ...], mission: Mission) -> Frame:
 
 
 class Environment:
-    """E flights side by side; each ends when all its batteries are empty, and then stays as it is.
+    """E parallel flights of one mission; a flight ends when all its batteries are empty.
 
     Attributes:
-        mission: the rules.
+        mission: the mission.
         frame: the present state; `step` overwrites it.
     """
 
@@ -69,14 +69,14 @@ class Environment:
         self._field = None
         if mission.shadowing_share > 0:
             self._field = CorrelatedField(shape[1:], mission.step_m, mission.shadowing_m)
-        # (E, K, ny, nx) part of each flight's shadowing that stays, in standard deviations
+        # (E, K, ny, nx) part of the shadowing that lasts for a flight [standard deviations]
         self._lasting = np.zeros((flights if self._field else 0, *shape), dtype=np.float32)
 
     def reset(self, which: np.ndarray | None = None) -> Frame:
-        """Put all UAVs at their starts with full batteries, and all data at their devices.
+        """Start flights: UAVs at their starts with full batteries, all data at the devices.
 
         Args:
-            which: (E,) bool, flights that begin anew while the others go on; None for all.
+            which: (E,) bool, flights to start while the others continue; None: all.
         """
         frame, mission = self.frame, self.mission
         which = np.ones(len(frame.cell), dtype=np.bool_) if which is None else which
@@ -104,20 +104,20 @@ class Environment:
 
     @property
     def done(self) -> np.ndarray:
-        """(E,) bool: all batteries are empty."""
+        """(E,) bool, whether all batteries of a flight are empty."""
         return (self.frame.battery == 0).all(axis=1)
 
 
 class ManyWorlds:
-    """W flights side by side, each in a world of its own, by the same compiled rules.
+    """W parallel flights, each in a mission of its own.
 
-    Worlds may differ in size; arrays over UAVs are padded to `uavs` of them. Shadowing is drawn
-    anew in every slot.
+    Missions may differ in size; arrays over UAVs are padded to `uavs`. Shadowing is drawn in every
+    slot.
 
     Attributes:
-        missions: W worlds.
-        frames: their states, each of a single flight; `step` overwrites them.
-        battery: (W, uavs) int64 left, in hovers; 0 for UAVs that a world does not have.
+        missions: W missions.
+        frames: their states, of a single flight each; `step` overwrites them.
+        battery: (W, uavs) int64 battery left [hovers]; 0 for padding.
     """
 
     def __init__(self, missions: list[Mission], uavs: int, rng: np.random.Generator) -> None:
@@ -129,7 +129,7 @@ class ManyWorlds:
             self.put(world, mission)
 
     def put(self, world: int, mission: Mission) -> None:
-        """Begin a flight of a mission, in place of the one of a number (0 to W - 1)."""
+        """Replace the flight of a world (0 to W - 1) by a new flight of a mission."""
         frame = empty_frame((1,), mission)
         frame.cell[0], frame.battery[0] = mission.start, mission.battery
         frame.data_units[0] = mission.data_units
@@ -139,7 +139,7 @@ class ManyWorlds:
         self.battery[world, :mission.uavs] = mission.battery
 
     def step(self, action: np.ndarray) -> np.ndarray:
-        """Fly one slot; actions and collected data (W, uavs) are as of `Environment.step`."""
+        """Fly one slot with actions (W, uavs); return the collected data units (W, uavs)."""
         collected = np.zeros(action.shape, np.float32)
         _step_all(self.missions, self.frames, action, self._lasting, self._rng, collected,
                   self.battery)
@@ -155,7 +155,7 @@ class CorrelatedField:
 
     def __init__(self, shape: tuple[int, int], step_m: float, length_m: float) -> None:
         self._shape = shape
-        # A torus on which opposite sides of the map are three lengths apart, hence uncorrelated.
+        # A torus that keeps opposite sides of the map three lengths apart, hence uncorrelated.
         around = [next_fast_len(side + min(side, int(np.ceil(3.0 * length_m / step_m))))
                   for side in shape]
         rows, columns = (np.minimum(np.arange(n), n - np.arange(n)) * step_m for n in around)
@@ -168,15 +168,21 @@ class CorrelatedField:
         parts = rng.standard_normal((pairs, *self._amplitude.shape, 2), dtype=np.float32)
         noise = parts.view(np.complex64)[..., 0]
         fields = fft2(noise * self._amplitude)[:, :self._shape[0], :self._shape[1]]
-        return np.concatenate([fields.real, fields.imag])[:count]  # the parts are independent
+        return np.concatenate([fields.real, fields.imag])[:count]  # both parts are independent
 
 
 @njit(cache=True, nogil=True)
 def feasible(mission: Mission, uav: int, row: int, column: int, battery: int,
              out: np.ndarray) -> None:
-    """Find the safe actions (paper, Sec. II-A): on the map, and with battery enough to fly home.
+    """Compute the safe actions (paper, Sec. II-A): on the map, with battery enough to fly home.
 
-    With an empty battery [hovers] that is no-op alone; `out` (6,) bool is overwritten.
+    Args:
+        mission: the mission.
+        uav: number of the UAV.
+        row: row of its cell.
+        column: column of its cell.
+        battery: battery left [hovers]; if it is empty, only the no-op is feasible.
+        out: (6,) bool, overwritten.
     """
     ny, nx = mission.steps_home.shape[1:]
     move_cost = COSTS[1]
@@ -189,10 +195,10 @@ def feasible(mission: Mission, uav: int, row: int, column: int, battery: int,
 
 
 def safe_actions(action: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Replace actions (E, U) that are not in the mask (E, U, 6) by the first feasible one.
+    """Replace infeasible actions (E, U), by a mask (E, U, 6), by the first feasible one.
 
-    That is hovering where the battery allows it, otherwise a move after which home can still be
-    reached, and no-op after landing.
+    That is to hover if the battery allows it, else a move from which home can be reached, and the
+    no-op after landing.
     """
     action = np.asarray(action, dtype=np.int64)
     allowed = np.take_along_axis(mask, action[..., None], axis=-1)[..., 0]
@@ -201,23 +207,23 @@ def safe_actions(action: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, nogil=True)
 def rate(snr_db: float, rate_scale: float) -> float:
-    """Return data units per slot (paper, Eq. 6: R = log2(1 + SNR) [bit/s/Hz])."""
+    """Return the data units per slot at an SNR [dB] (paper, Eq. 6: log2(1 + SNR) [bit/s/Hz])."""
     return rate_scale * np.log2(1.0 + 10.0 ** (snr_db / 10.0))
 
 
 @njit(cache=True, nogil=True)
 def assign(strength: np.ndarray, max_rate: bool, out: np.ndarray) -> None:
-    """Match UAVs and devices, each with at most one of the other (paper, Eq. 7 and 8).
+    """Assign at most one device to each UAV, and one UAV to each device (paper, Eq. 7 and 8).
 
     Args:
-        strength: (U, K) of each link, -inf where it cannot be used; overwritten.
+        strength: (U, K) strength of each link, -inf = not usable; overwritten.
         max_rate: see `Mission`.
         out: (U,) device or -1, overwritten.
     """
     out[:] = -1
     for first in range(len(strength)):
-        # Deferred acceptance: who loses a device takes the next one. As both sides prefer the
-        # stronger link, this is the matching by the strongest remaining pair.
+        # Deferred acceptance: a UAV that loses a device proposes to the next one. As both sides
+        # prefer the stronger link, the result is the greedy matching by strongest pair.
         u = first
         while u >= 0:
             k = np.argmax(strength[u])
@@ -240,7 +246,7 @@ def assign(strength: np.ndarray, max_rate: bool, out: np.ndarray) -> None:
 @njit(cache=True, nogil=True)
 def _sense(mission: Mission, frame: Frame, flying: np.ndarray, lasting: np.ndarray,
            rng: np.random.Generator) -> None:
-    """Draw this slot's SNRs and assign devices, in the flights that are still flying."""
+    """Draw the SNRs of a slot, and assign devices, in the flights of the mask `flying` (E,)."""
     uavs, devices = len(mission.start), len(mission.data_units)
     of_slot = np.sqrt(1.0 - mission.shadowing_share)
     strength = np.empty((uavs, devices))
@@ -260,7 +266,7 @@ def _sense(mission: Mission, frame: Frame, flying: np.ndarray, lasting: np.ndarr
                 if snr_db < mission.detection_db:
                     snr_db = np.float32(-np.inf)
                 frame.snr_db[e, u, k] = snr_db
-                # A UAV with an empty battery has landed and collects no more.
+                # A UAV with an empty battery has landed and does not collect.
                 usable = (frame.battery[e, u] > 0 and frame.data_units[e, k] > 0
                           and snr_db >= mission.threshold_db)
                 strength[u, k] = snr_db if usable else -np.inf
@@ -270,6 +276,7 @@ def _sense(mission: Mission, frame: Frame, flying: np.ndarray, lasting: np.ndarr
 @njit(cache=True, nogil=True)
 def _step(mission: Mission, frame: Frame, action: np.ndarray, lasting: np.ndarray,
           rng: np.random.Generator) -> np.ndarray:
+    """Fly one slot of all flights of a mission; return the collected data units (E, U)."""
     flights, uavs = action.shape
     collected = np.zeros((flights, uavs), dtype=np.float32)
     flying = np.zeros(flights, dtype=np.bool_)
@@ -296,6 +303,7 @@ def _step(mission: Mission, frame: Frame, action: np.ndarray, lasting: np.ndarra
 def _step_all(missions: "List[Mission]", frames: "List[Frame]", action: np.ndarray,
               lasting: np.ndarray, rng: np.random.Generator, collected: np.ndarray,
               battery: np.ndarray) -> None:
+    """Fly one slot of one flight in each mission; write collected data and batteries (W, uavs)."""
     for w in range(len(missions)):
         uavs = len(missions[w].start)
         collected[w, :uavs] = _step(missions[w], frames[w], action[w:w + 1, :uavs], lasting, rng)[0]
@@ -303,17 +311,17 @@ def _step_all(missions: "List[Mission]", frames: "List[Frame]", action: np.ndarr
 
 
 def observation_size(mission: Mission) -> int:
-    """Return the number of features that one agent sees."""
+    """Return the number of features of one agent's observation."""
     return DEVICE_FEATURES * mission.devices + UAV_FEATURES * (mission.uavs - 1) + OWN_FEATURES
 
 
 def state_size(mission: Mission) -> int:
-    """Return the number of features that the mixer sees."""
+    """Return the number of features of the mixer's global state."""
     return STATE_UAV_FEATURES * mission.uavs + STATE_DEVICE_FEATURES * mission.devices
 
 
 def observe(mission: Mission, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
-    """Return (E, U, observation_size) float32 observations, and (E, U, 6) bool feasible actions."""
+    """Return observations (E, U, observation_size) float32 and feasible actions (E, U, 6) bool."""
     shape = frame.battery.shape
     observation = np.empty((*shape, observation_size(mission)), dtype=np.float32)
     mask = np.empty((*shape, ACTION_COUNT), dtype=np.bool_)
@@ -322,7 +330,7 @@ def observe(mission: Mission, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
 
 
 def global_state(mission: Mission, frame: Frame) -> np.ndarray:
-    """Return the (E, state_size) float32 state of E frames."""
+    """Return the global state (E, state_size) float32 for the mixer."""
     state = np.empty((len(frame.battery), state_size(mission)), dtype=np.float32)
     _global_state(mission, frame, state)
     return state
@@ -330,13 +338,13 @@ def global_state(mission: Mission, frame: Frame) -> np.ndarray:
 
 @njit(cache=True, nogil=True)
 def uav_snr_db(mission: Mission, distance_m: float) -> float:
-    """Return the SNR between two UAVs [dB]."""
+    """Return the SNR between two UAVs at a distance [m] by the LoS law [dB]."""
     return mission.uav_link_db[0] + mission.uav_link_db[1] * np.log10(max(distance_m, 1.0))
 
 
 @njit(cache=True, nogil=True)
 def _scaled_snr(mission: Mission, snr_db: float) -> float:
-    """Return the SNR over the threshold in 20 dB; a link that is not detected shows -2."""
+    """Return the SNR above the threshold over 20 dB, clipped to -2 (also not detected) to 3."""
     return min(max((snr_db - mission.threshold_db) / 20.0, -2.0), 3.0)
 
 
@@ -348,6 +356,7 @@ def _length_scale_m(mission: Mission) -> float:
 
 @njit(cache=True, nogil=True)
 def _observe(mission: Mission, frame: Frame, observation: np.ndarray, mask: np.ndarray) -> None:
+    """Write the observations and feasible actions of `observe`."""
     flights, uavs, devices = frame.snr_db.shape
     scale_m = _length_scale_m(mission)
     for e in range(flights):
@@ -399,6 +408,7 @@ def _observe(mission: Mission, frame: Frame, observation: np.ndarray, mask: np.n
 
 @njit(cache=True, nogil=True)
 def _global_state(mission: Mission, frame: Frame, state: np.ndarray) -> None:
+    """Write the global state of `global_state`."""
     flights, uavs, devices = frame.snr_db.shape
     scale_m = _length_scale_m(mission)
     for e in range(flights):

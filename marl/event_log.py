@@ -1,6 +1,6 @@
-"""Events for TensorBoard, on the disk when the call returns.
+"""Write TensorBoard events synchronously.
 
-TensorBoard's own writer has a thread that writes; where the disk is full it ends in a traceback.
+TensorBoard's own writer uses a thread, which ends in a traceback if the disk is full.
 """
 
 import os
@@ -21,10 +21,10 @@ VERSION = "brain.Event:2"
 
 
 class EventLog:
-    """The events of one run, in a folder of their own.
+    """TensorBoard events of one run.
 
     Args:
-        folder: is emptied: a resumed run logs its first rounds again, so nothing is there twice.
+        folder: folder of the events; it is emptied, since a resumed run logs all rounds again.
 
     Raises:
         RunFailed: the disk is full or failed, here and in `flush`.
@@ -40,13 +40,13 @@ class EventLog:
             raise self._failed(error) from error
 
     def add(self, group: str, step: int, values: Mapping[str, float]) -> None:
-        """Add the finite numbers of one step, in a group that TensorBoard shows together."""
+        """Add the finite values of one step under the tags `group/name`."""
         summary = Summary(value=[Summary.Value(tag=f"{group}/{name}", simple_value=value)
                                  for name, value in values.items() if np.isfinite(value)])
         self._events.append(Event(wall_time=time.time(), step=step, summary=summary))
 
     def flush(self) -> None:
-        """Write what was added since the last call."""
+        """Write the events added since the last call to disk."""
         try:
             with self._path.open("ab") as file:
                 records = RecordWriter(file)
@@ -59,5 +59,6 @@ class EventLog:
         self._events.clear()
 
     def _failed(self, error: OSError) -> RunFailed:
+        """Return the error to raise if the events cannot be written."""
         return RunFailed(f"cannot write {self._path}: {error.strerror or error}; the finished "
                          "rounds are kept: make room, and go on with --resume")

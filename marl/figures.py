@@ -1,4 +1,4 @@
-"""Figures of a run: trajectories as in the paper, and collected data against real flights."""
+"""Figures of a run: trajectories over the city, learning curves, and animations."""
 
 from pathlib import Path
 from typing import Any
@@ -29,21 +29,21 @@ LEVEL_STYLES = ("--", ":", "-.")
 
 
 def choose_flight(flights: Flights, mission: Mission) -> int:
-    """Return the index of the flight whose collected share is nearest the median."""
+    """Return the index of the flight whose collected share is nearest to the median."""
     ratio = flights.ratio(mission)
     return int(np.abs(ratio - np.median(ratio)).argmin())
 
 
 def trajectories_figure(scene: Scene, mission: Mission, flights: Flights, flight: int,
                         known: Known | None) -> Figure:
-    """Draw one flight over the city, a panel for each UAV.
+    """Draw the trajectories of one flight over the city, with a panel for each UAV.
 
     Args:
-        scene: the city, and the true positions of its devices.
-        mission: that was flown.
-        flights: a record.
-        flight: index of the flight in it.
-        known: positions as the UAVs knew them; None: those of the scene are no others.
+        scene: scene with the true device positions.
+        mission: mission that was flown.
+        flights: record of flights.
+        flight: index of the flight.
+        known: device positions that the UAVs knew; None: the scene's.
     """
     x_min, x_max, y_min, y_max = scene.config.extent.bounds
     width_in = 5.6 * min(max((x_max - x_min) / (y_max - y_min), 0.6), 1.6)
@@ -72,17 +72,17 @@ def trajectories_figure(scene: Scene, mission: Mission, flights: Flights, flight
 
 
 def draw_curve(curves: dict[str, list[dict]], levels: dict[str, float], path: Path | str) -> None:
-    """Write `curve_figure` as PNG."""
+    """Draw `curve_figure`, and write it as PNG."""
     save(curve_figure(curves, levels), path)
 
 
 def curve_figure(curves: dict[str, list[dict]], levels: dict[str, float]) -> Figure:
-    """Draw the collected share against real episodes.
+    """Draw the collected share against the number of real episodes, with bands.
 
     Args:
-        curves: name -> rows with `real_episodes`, `truth_ratio`, and `truth_ratio_std` or `low`
-            and `high`; rows without any real episode are left out.
-        levels: name of a baseline -> its share.
+        curves: rows with `real_episodes`, `truth_ratio`, and `truth_ratio_std` or `low` and `high`,
+            by name; rows without a real episode are left out.
+        levels: collected share of each baseline, drawn as a horizontal line.
     """
     figure = Figure(figsize=(8.5, 5.2), layout="constrained")
     FigureCanvasAgg(figure)
@@ -103,8 +103,8 @@ def curve_figure(curves: dict[str, list[dict]], levels: dict[str, float]) -> Fig
     axes.set(ylim=(0, 1.02), xlabel="real episodes",
              ylabel="share of all data collected in the truth")
     if any(row["real_episodes"] > 0 for rows in curves.values() for row in rows):
-        axes.set_xscale("log")  # which fails where there is nothing to show
-        axes.xaxis.set_major_formatter(LogFormatter())  # 1, 2, 10, and no powers
+        axes.set_xscale("log")  # it fails without data
+        axes.xaxis.set_major_formatter(LogFormatter())  # plain numbers instead of powers of ten
         axes.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1, 0.4)))
     axes.grid(alpha=0.3, which="both")
     figure.legend(loc="outside lower center", ncols=3, frameon=False)
@@ -112,11 +112,11 @@ def curve_figure(curves: dict[str, list[dict]], levels: dict[str, float]) -> Fig
 
 
 class FlightPicture:
-    """The UAVs of a flight over the city, from above, slot by slot.
+    """Picture of a flight over the city from above, redrawn for each slot.
 
     Args:
-        scene: the city, and the true positions of its devices.
-        mission: that is flown.
+        scene: scene with the true device positions.
+        mission: mission that is flown.
     """
 
     def __init__(self, scene: Scene, mission: Mission) -> None:
@@ -139,15 +139,15 @@ class FlightPicture:
         self._text = self._axes.text(0.01, 0.99, "", transform=self._axes.transAxes, va="top")
 
     def image(self, cells: np.ndarray, assigned: np.ndarray, data_units: np.ndarray) -> np.ndarray:
-        """Draw a slot: devices as large as their data, UAVs in the colour of what serves them.
+        """Draw a slot: devices scaled by their data, UAVs in the colour of the assigned device.
 
         Args:
-            cells: (T, U, 2) of the slots so far, row and column.
-            assigned: (U,) device that serves each UAV, -1 for none.
-            data_units: (K,) left.
+            cells: (T, U, 2) cells (row, column) in the slots so far.
+            assigned: (U,) device assigned to each UAV, -1 for none.
+            data_units: (K,) data left at each device.
 
         Returns:
-            (height, width, 3) uint8
+            (height, width, 3) uint8 image.
         """
         lattice, step_m = self._scene.lattice, self._mission.step_m
         for u, (trail, uav) in enumerate(zip(self._trails, self._uavs)):
@@ -179,13 +179,14 @@ def save_animation(scene: Scene, mission: Mission, flights: Flights, flight: int
 
 
 def _device_colours(count: int) -> list:
+    """Return a colour for each of `count` devices."""
     if count <= 10:
         return [colormaps["tab10"](k) for k in range(count)]
     return [colormaps["gist_rainbow"](k / count) for k in range(count)]
 
 
 def _collected_by_device(flights: Flights, flight: int, mission: Mission) -> np.ndarray:
-    """Return (U, K) data units."""
+    """Return the data units (U, K) that each UAV collected from each device in a flight."""
     collected = np.zeros((mission.uavs, mission.devices))
     for slot in range(flights.length[flight]):
         for u in range(mission.uavs):
@@ -197,13 +198,14 @@ def _collected_by_device(flights: Flights, flight: int, mission: Mission) -> np.
 
 def _draw_path(axes: Axes, scene: Scene, mission: Mission, flights: Flights, flight: int, u: int,
                colours: list) -> None:
+    """Draw one UAV's path, hovers, start and terminal."""
     slots = slice(0, flights.length[flight])
     flying = flights.frames.battery[flight, slots, u] > 0
     cells = flights.frames.cell[flight, slots, u][flying].astype(float)
     served = flights.frames.assigned[flight, slots, u][flying]
     x_m = scene.lattice.x_m[0] + cells[:, 1] * mission.step_m
     y_m = scene.lattice.y_m[0] + cells[:, 0] * mission.step_m
-    # A little to the right of the direction of flight, so that the way back does not hide the way
+    # Shifted to the right of the direction of flight, so that the way back does not hide the way
     # out.
     points = np.stack([x_m, y_m], axis=1)
     steps = np.diff(points, axis=0)
@@ -228,6 +230,7 @@ def _draw_path(axes: Axes, scene: Scene, mission: Mission, flights: Flights, fli
 
 def _draw_devices(axes: Axes, scene: Scene, known: Known | None, colours: list,
                   share: np.ndarray) -> None:
+    """Draw the devices with the share (K,) of their data that the UAV collected."""
     for k, device in enumerate(scene.config.devices):
         marker, size = ("^", 11) if device.role == "anchor" else ("*", 15)
         axes.plot(device.x_m, device.y_m, marker, color=colours[k], markersize=size,
@@ -243,13 +246,14 @@ def _draw_devices(axes: Axes, scene: Scene, known: Known | None, colours: list,
                       path_effects=[withStroke(linewidth=2.5, foreground="white")])
 
 
-def _legend(is_truth_known: bool) -> list[Line2D]:
+def _legend(has_estimates: bool) -> list[Line2D]:
+    """Return the legend of the trajectories, with or without marks of estimated positions."""
     def mark(marker: str, label: str, size: float, **style: Any) -> Line2D:
         return Line2D([], [], linestyle="", marker=marker, label=label, markersize=size,
                       color="black", **style)
 
     unknown = [mark("*", "unknown device, true position", 12),
-               mark("x", "its estimate", 7, markeredgewidth=1.6)] if is_truth_known else [
+               mark("x", "its estimate", 7, markeredgewidth=1.6)] if has_estimates else [
         mark("*", "unknown device, where it is thought to be", 12)]
     return [mark("^", "anchor", 9), *unknown,
             mark("s", "start", 9, markerfacecolor="none"),
@@ -259,6 +263,6 @@ def _legend(is_truth_known: bool) -> list[Line2D]:
 
 
 def save(figure: Figure, path: Path | str, dpi: int = 130) -> None:
-    """Write a figure as PNG, whole or not at all."""
+    """Write a figure as PNG atomically."""
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=dpi)

@@ -1,4 +1,4 @@
-"""Fly whole flights with a policy, and record them."""
+"""Simulate whole flights with a policy, and record them."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -19,7 +19,7 @@ class Flights:
         frames: `Frame` of arrays (E, T, …): the state before each action.
         action: (E, T, U) int8.
         collected: (E, T, U) float32 data units.
-        length: (E,) int32 slots until all batteries were empty; the rest is padding.
+        length: (E,) int32 slots until all batteries were empty; later slots are padding.
     """
 
     frames: Frame
@@ -28,23 +28,23 @@ class Flights:
     length: np.ndarray
 
     def ratio(self, mission: Mission) -> np.ndarray:
-        """Return the (E,) share of all data that was collected."""
-        waiting = self.frames.data_units[:, 0].sum(axis=1, dtype=float)
-        return self.collected.sum(axis=(1, 2), dtype=float) / waiting
+        """Return the (E,) share of all data that each flight collected."""
+        initial = self.frames.data_units[:, 0].sum(axis=1, dtype=float)
+        return self.collected.sum(axis=(1, 2), dtype=float) / initial
 
 
 class Policy(Protocol):
     """Decides the actions of E flights, slot by slot."""
 
     def start(self, mission: Mission, flights: int) -> None:
-        """Forget the flights before, and prepare for some new ones."""
+        """Reset the policy for E = `flights` new flights of a mission."""
 
     def act(self, frame: Frame) -> np.ndarray:
-        """Return (E, U) feasible actions."""
+        """Return feasible actions (E, U) for the present slot."""
 
 
 def fly(environment: Environment, policy: Policy) -> Flights:
-    """Fly from take-off until all batteries are empty, and record everything."""
+    """Fly a policy from take-off until all batteries are empty, and record every slot."""
     mission, frame = environment.mission, environment.reset()
     count = len(frame.battery)
     policy.start(mission, count)
@@ -62,20 +62,20 @@ def fly(environment: Environment, policy: Policy) -> Flights:
         flying = ~environment.done
         slot += 1
     for kept, now in zip(record.frames, frame):
-        kept[:, slot:] = now[:, None]  # padding with a state that features can be made of
+        kept[:, slot:] = now[:, None]  # padded with a valid state, so that features can be computed
     return record
 
 
 def evaluate(mission: Mission, policy: Policy, flights: int, rng: np.random.Generator) -> Flights:
-    """Fly a policy to judge it; `rng` draws the shadowing."""
+    """Fly a policy for E = `flights` flights of a mission; `rng` draws the shadowing."""
     return fly(Environment(mission, flights, rng), policy)
 
 
 def track_table(scene: Scene, mission: Mission, flights: Flights, flight: int) -> pd.DataFrame:
-    """Return one flight as a table, a row for every slot until the UAV's battery is empty.
+    """Return one flight as a table with a row for each UAV and slot until its battery is empty.
 
     Returns:
-        flight, uav, time_s, x_m, y_m, z_m, device (that served the UAV there, empty for none),
+        columns flight, uav, time_s, x_m, y_m, z_m, device (assigned to the UAV, empty for none),
         collected [data units].
     """
     parts, frames = [], flights.frames

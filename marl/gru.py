@@ -1,7 +1,7 @@
-"""The recurrent unit of an agent, forwards and backwards as compiled loops.
+"""GRU with compiled forward and backward loops, for the agents' recurrent layer.
 
-`torch.nn.GRU` spends three quarters of its time on starting small operations, because the sequence
-is long and the matrices are small. Parameters and numbers are those of `torch.nn.GRU` (Cho et al.,
+`torch.nn.GRU` spends three quarters of its time on launching small operations, because sequences
+are long and matrices small. Parameters and results are those of `torch.nn.GRU` (Cho et al.,
 "Learning phrase representations using RNN encoder-decoder", EMNLP 2014, in the variant of cuDNN):
 
     r = σ(W_r x + U_r h + b_r),  z = σ(W_z x + U_z h + b_z),
@@ -22,19 +22,18 @@ _ONE, _HALF = np.float32(1), np.float32(0.5)
 
 def gru(x: Tensor, sizes: np.ndarray, memory: Tensor | None,
         unit: torch.nn.GRU) -> tuple[Tensor, Tensor]:
-    """Return what `unit` makes of sequences of different lengths, for one layer in one direction.
+    """Apply a one-layer GRU to packed sequences (as `torch.nn.utils.rnn.PackedSequence`).
 
-    They are packed as by `torch.nn.utils.rnn.PackedSequence`: slot by slot, the longest first. The
-    result is differentiable by x and the parameters; the memory is taken as a constant.
+    The result is differentiable by x and the parameters, not by the memory.
 
     Args:
-        x: (N, inputs) float32
-        sizes: (T,) int64 number of sequences that reach each slot, their sum is N.
-        memory: (sizes[0], hidden) before the first slot, zero where None.
-        unit: gives the parameters.
+        x: (N, inputs) float32 inputs, slot by slot, the longest sequence first.
+        sizes: (T,) int64 number of sequences that reach each slot; their sum is N.
+        memory: (sizes[0], hidden) initial hidden state; None: zero.
+        unit: the GRU with the parameters.
 
     Returns:
-        (N, hidden), and the (sizes[-1], hidden) of the last slot.
+        hidden states (N, hidden), and those of the last slot (sizes[-1], hidden).
     """
     if x.device.type != "cpu":
         packed = PackedSequence(x, torch.from_numpy(sizes))
@@ -47,24 +46,23 @@ def gru(x: Tensor, sizes: np.ndarray, memory: Tensor | None,
 
 
 class _Walk(torch.autograd.Function):
-    """Map x (N, inputs) to memories (N, H); gates come first in all arrays."""
+    """Differentiable map from inputs (N, inputs) to hidden states (N, H)."""
 
     @staticmethod
     def forward(context: Any, x: Tensor, weight: Tensor, recurrent: Tensor, bias: Tensor,
                 recurrent_bias: Tensor, start: Tensor, sizes: np.ndarray) -> Tensor:
         """See `torch.autograd.Function`; the parameters are those of `torch.nn.GRU`."""
         hidden = len(bias) // 3
-        # The biases of r and z add up; that of n is inside the bracket that r scales.
+        # Both biases of r and z add up; the recurrent bias of n is scaled by r.
         bias = bias.clone()
         bias[:2 * hidden] += recurrent_bias[:2 * hidden]
-        # One array for all that follows, because fresh memory costs more than the arithmetic: the
-        # input's shares of the gates, then the gates r, z, n and u = U_n h + c_n in their
-        # positions, then the gradients by them.
+        # One work array, since allocation costs more than the arithmetic. It holds the inputs'
+        # contributions to the gates, then the gates r, z, n, u = U_n h + c_n, then the gradients.
         work = torch.empty(4, len(x), hidden)
         for gate in range(3):
             rows = slice(gate * hidden, (gate + 1) * hidden)
             torch.addmm(bias[rows], x, weight[rows].t(), out=work[gate])
-        memories = torch.cat([start, torch.empty(len(x), hidden)])  # that before each slot, too
+        memories = torch.cat([start, torch.empty(len(x), hidden)])  # with the initial state
         transposed = recurrent.view(3, hidden, hidden).transpose(1, 2).contiguous()
         _forward(work.numpy(), transposed.numpy(), recurrent_bias[2 * hidden:].numpy(),
                  memories.numpy(), sizes)
@@ -92,10 +90,7 @@ class _Walk(torch.autograd.Function):
 
 @njit(cache=True, inline="always", fastmath=True, error_model="numpy")
 def _tanh(x: np.float32) -> np.float32:
-    """Return a rational approximation, exact to two units in the last place of a float32.
-
-    Unlike exp, it is vectorised.
-    """
+    """Return tanh by a rational approximation that vectorises, exact to 2 ulp of a float32."""
     x = min(max(x, np.float32(-7.9)), np.float32(7.9))
     s = x * x
     p = np.float32(-2.76076847742355e-16)
@@ -116,6 +111,7 @@ def _tanh(x: np.float32) -> np.float32:
 def _cell(r: np.ndarray, z: np.ndarray, n: np.ndarray, u: np.ndarray, r_h: np.ndarray,
           z_h: np.ndarray, n_h: np.ndarray, n_bias: np.ndarray, before: np.ndarray,
           after: np.ndarray) -> None:
+    """Compute the gates and hidden states of one slot in place."""
     for b in range(len(before)):
         for i in range(len(n_bias)):
             r[b, i] = _HALF + _HALF * _tanh(_HALF * (r[b, i] + r_h[b, i]))
@@ -131,6 +127,7 @@ def _cell(r: np.ndarray, z: np.ndarray, n: np.ndarray, u: np.ndarray, r_h: np.nd
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _forward(work: np.ndarray, recurrent: np.ndarray, n_bias: np.ndarray, memories: np.ndarray,
              sizes: np.ndarray) -> None:
+    """Run all slots forwards: fill the gates in `work` and the hidden states in `memories`."""
     share = np.empty((3, sizes[0], memories.shape[1]), np.float32)
     before, first = 0, 0  # rows of the slot before in `memories`, and of this slot in `work`
     for size in sizes:
@@ -146,6 +143,7 @@ def _forward(work: np.ndarray, recurrent: np.ndarray, n_bias: np.ndarray, memori
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _cell_backward(gradient: np.ndarray, r: np.ndarray, z: np.ndarray, n: np.ndarray,
                    u: np.ndarray, before: np.ndarray, carried: np.ndarray) -> None:
+    """Replace the gates of one slot by the gradients by them, and update the carried gradient."""
     for b in range(len(before)):
         for i in range(before.shape[1]):
             r_bi, z_bi, n_bi = r[b, i], z[b, i], n[b, i]
@@ -161,6 +159,7 @@ def _cell_backward(gradient: np.ndarray, r: np.ndarray, z: np.ndarray, n: np.nda
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _backward(gradient: np.ndarray, recurrent: np.ndarray, memories: np.ndarray, work: np.ndarray,
               before: np.ndarray, sizes: np.ndarray) -> None:
+    """Run all slots backwards: replace the gates in `work` by gradients, and fill `before`."""
     hidden = gradient.shape[1]
     carried = np.zeros((sizes[0], hidden), np.float32)
     share = np.empty((3, sizes[0], hidden), np.float32)

@@ -1,6 +1,4 @@
-"""Flights without learning and map: random, greedy, weighed, and between random cells."""
-
-from collections.abc import Callable
+"""Flights without learning and without a map: random, greedy, heuristic, between random cells."""
 
 import numpy as np
 from typing_extensions import override
@@ -18,19 +16,18 @@ PATTERN = "random-waypoint"
 
 
 WEIGHTS = np.array([0.75, 2.9, 2.88, 0.28, 0.31, 0.91, 0.06, 0.21, 0.66])
-"""Of `heuristic`, as `python -m studies.heuristic` tunes them on 20 generated missions.
+"""Weights of `heuristic`, tuned by `python -m studies.heuristic` on 20 generated missions.
 
-Of a device for a UAV: the share of its data that is left; the steps there (of the sides of the
-lattice), and the battery that lacks for them and the way home (of a full one), which count
-against it; its rate in this slot [10 bit/s/Hz]; the steps home from it, as the battery empties,
-against it; the steps from the nearest other UAV; the other devices with data about it (each
-exp(-distance / 200 m)). Then the distance at which the UAV hovers [steps], and what is added to
-it as the device empties.
+The first seven score a device for a UAV: + share of its data left; - steps to it (over the sides of
+the lattice); - battery missing for the way there and home (over a full one); + its rate in this
+slot [10 bit/s/Hz]; - steps home from it, more as the battery empties; + steps from the nearest
+other UAV; + other devices with data around it (exp(-distance / 200 m) each). The last two are the
+distance at which the UAV hovers [steps], and its increase as the device empties.
 """
 
 
 class HeuristicPolicy:
-    """Fly `random`, `greedy`, or `heuristic` with the weights given."""
+    """Policy `random`, `greedy`, or `heuristic` with given weights."""
 
     def __init__(self, name: str, rng: np.random.Generator, weights: np.ndarray = WEIGHTS) -> None:
         self._name, self._rng, self._weights = name, rng, weights
@@ -48,15 +45,10 @@ class HeuristicPolicy:
 
 
 class Random(Learner):
-    """`--algorithm random`: any feasible action in every slot."""
+    """`--algorithm random`: fly a random feasible action in every slot."""
 
     learns = uses_map = False
     name = "random"
-
-    @override
-    def prepare(self, mission: Mission,
-                on_progress: Callable[[int], None]) -> list[dict[str, float]]:
-        return []
 
     @override
     def policy(self, rng: np.random.Generator) -> Policy:
@@ -64,21 +56,21 @@ class Random(Learner):
 
 
 class Greedy(Random):
-    """`--algorithm greedy`: to the nearest device with data that no other UAV has claimed."""
+    """`--algorithm greedy`: fly to the nearest device with data that no other UAV has claimed."""
 
     name = "greedy"
 
 
 class Heuristic(Random):
-    """`--algorithm heuristic`: to the devices that a sum with tuned weights prefers."""
+    """`--algorithm heuristic`: fly to the device with the highest weighted score (`WEIGHTS`)."""
 
     name = "heuristic"
 
 
 def waypoint_actions(scene: Scene, mission: Mission, rng: np.random.Generator) -> np.ndarray:
-    """Return flights (T, U) of all UAVs that measure: straight from one random cell to the next.
+    """Return the actions (T, U) of a measuring flight: straight from one random cell to the next.
 
-    Battery that is left when no other cell can be flown to and home from is used to hover.
+    When the battery is too low for another cell and the way home, the UAV flies home and hovers.
     """
     moves = {tuple(move): action for action, move in enumerate(MOVES)
              if action not in (HOVER, NO_OP)}
@@ -92,7 +84,7 @@ def waypoint_actions(scene: Scene, mission: Mission, rng: np.random.Generator) -
 
 @njit(cache=True, nogil=True)
 def random_actions(mission: Mission, frame: Frame, rng: np.random.Generator) -> np.ndarray:
-    """Return (E, U) feasible actions, all with the same probability."""
+    """Draw feasible actions (E, U) uniformly."""
     flights, uavs = frame.battery.shape
     action = np.empty((flights, uavs), dtype=np.int64)
     mask = np.empty(ACTION_COUNT, dtype=np.bool_)
@@ -100,12 +92,13 @@ def random_actions(mission: Mission, frame: Frame, rng: np.random.Generator) -> 
         for u in range(uavs):
             feasible(mission, u, frame.cell[e, u, 0], frame.cell[e, u, 1], frame.battery[e, u],
                      mask)
-            action[e, u] = _any_of(mask, rng)
+            action[e, u] = _draw_feasible(mask, rng)
     return action
 
 
 @njit(cache=True, nogil=True)
-def _any_of(mask: np.ndarray, rng: np.random.Generator) -> int:
+def _draw_feasible(mask: np.ndarray, rng: np.random.Generator) -> int:
+    """Draw one of the feasible actions of a mask (6,) uniformly."""
     nth = int(rng.random() * mask.sum())
     for a in range(ACTION_COUNT):
         if mask[a]:
@@ -117,11 +110,11 @@ def _any_of(mask: np.ndarray, rng: np.random.Generator) -> int:
 
 @njit(cache=True, nogil=True)
 def greedy_actions(mission: Mission, frame: Frame, rng: np.random.Generator) -> np.ndarray:
-    """Return (E, U) greedy actions with distinct targets.
+    """Return greedy actions (E, U) with distinct targets.
 
-    Each UAV that has not landed, one after the other, claims the nearest device with data that
-    nobody claimed, flies towards it along the larger axis and hovers on top. Where that is not
-    feasible: the other axis, then any feasible action.
+    One after the other, each flying UAV claims the nearest unclaimed device with data, flies
+    towards it along the larger axis, and hovers above it. If that is not feasible, it takes the
+    other axis, then a random feasible action.
     """
     flights, uavs = frame.battery.shape
     devices = len(mission.data_units)
@@ -131,7 +124,7 @@ def greedy_actions(mission: Mission, frame: Frame, rng: np.random.Generator) -> 
     for e in range(flights):
         claimed[:] = False
         for u in range(uavs):
-            if frame.battery[e, u] == 0:  # it has landed: what it claimed nobody would fly to
+            if frame.battery[e, u] == 0:  # a landed UAV must not claim a device
                 action[e, u] = NO_OP
                 continue
             row, column = frame.cell[e, u, 0], frame.cell[e, u, 1]
@@ -144,21 +137,22 @@ def greedy_actions(mission: Mission, frame: Frame, rng: np.random.Generator) -> 
                     target, nearest = k, dx**2 + dy**2
             feasible(mission, u, row, column, frame.battery[e, u], mask)
             if target < 0:
-                action[e, u] = HOVER if mask[HOVER] else _any_of(mask, rng)
+                action[e, u] = HOVER if mask[HOVER] else _draw_feasible(mask, rng)
                 continue
             claimed[target] = True
-            action[e, u] = _towards(mission, row, column, mission.known_m[target], 0.0, mask)
+            action[e, u] = _move_towards_point(mission, row, column, mission.known_m[target], 0.0,
+                                               mask)
             if action[e, u] < 0:
-                action[e, u] = _any_of(mask, rng)
+                action[e, u] = _draw_feasible(mask, rng)
     return action
 
 
 @njit(cache=True, nogil=True)
-def _towards(mission: Mission, row: int, column: int, target_m: np.ndarray, stop_m: float,
-             mask: np.ndarray) -> int:
-    """Return a move towards a point along the larger axis, else along the other; -1 for none.
+def _move_towards_point(mission: Mission, row: int, column: int, target_m: np.ndarray,
+                        stop_m: float, mask: np.ndarray) -> int:
+    """Return a feasible move from a cell towards a point (2,) [m], or hover within `stop_m` of it.
 
-    Hover on top, or within `stop_m` of it.
+    The larger axis comes first, then the other one; -1 if neither is feasible.
     """
     dx, dy = target_m[0] - column * mission.step_m, target_m[1] - row * mission.step_m
     along_x, along_y = abs(dx) > mission.step_m / 2, abs(dy) > mission.step_m / 2
@@ -175,10 +169,15 @@ def _towards(mission: Mission, row: int, column: int, target_m: np.ndarray, stop
 
 @njit(cache=True, nogil=True)
 def weighed_actions(mission: Mission, frame: Frame, weights: np.ndarray) -> np.ndarray:
-    """Return (E, U) actions towards distinct targets, the pair with the highest sum first.
+    """Return actions (E, U) towards distinct devices, assigned by the highest score first.
 
-    `weights` are as `WEIGHTS`. A UAV that is left without a target helps at its best one. Where
-    the way there is not feasible, it hovers as long as it can and then flies home.
+    A UAV left without a device of its own flies to its best one. If no move towards it is feasible,
+    the UAV hovers as long as it can and then flies home.
+
+    Args:
+        mission: mission with the known positions of the devices.
+        frame: present state of E flights.
+        weights: (9,) see `WEIGHTS`.
     """
     flights, uavs = frame.battery.shape
     devices, (ny, nx) = len(mission.data_units), mission.steps_home.shape[1:]
@@ -228,7 +227,8 @@ def weighed_actions(mission: Mission, frame: Frame, weights: np.ndarray) -> np.n
             if k >= 0:
                 emptied = 1 - frame.data_units[e, k] / mission.data_units[k]
                 stop_m = step_m * (weights[7] + weights[8] * emptied)
-                chosen = _towards(mission, row, column, mission.known_m[k], stop_m, mask)
+                chosen = _move_towards_point(mission, row, column, mission.known_m[k], stop_m,
+                                             mask)
             if chosen < 0 and mask[HOVER]:
                 chosen = HOVER
             for move in range(ACTION_COUNT):

@@ -1,7 +1,7 @@
-"""The mission as environments for other libraries of learners: PettingZoo's and Gymnasium's.
+"""Adapters of the environment for PettingZoo and Gymnasium.
 
-`HarvestEnv` has an agent for each UAV; in `CentralEnv` and `CentralVectorEnv` one learner decides
-for all UAVs.
+`HarvestEnv` has an agent for each UAV; in `CentralEnv` and `CentralVectorEnv` one agent controls
+all UAVs.
 """
 
 from pathlib import Path
@@ -39,17 +39,17 @@ Arrays = dict[str, np.ndarray]
 
 
 class HarvestEnv(ParallelEnv[str, Arrays, int]):
-    """One flight of all UAVs; the numbers are those of `marl.environment.Environment`.
+    """PettingZoo environment of one flight, with `marl.environment.Environment` inside.
 
     Observation: `observation`, float32 as in `marl.environment.observe`, and `action_mask`, (6,)
-    int8. Actions: hover, north, west, south, east, no-op; one that is not
-    feasible is replaced (`safe_actions`), and `infos[agent]["replaced"]` says so. Reward: data
-    units that the UAV itself collected in the slot; the sum over UAVs is the team's reward. A UAV
-    terminates with an empty battery, which is at its terminal.
+    int8. Actions: hover, north, west, south, east, no-op; an infeasible action is replaced
+    (`safe_actions`), and `infos[agent]["replaced"]` is true. Reward: data units that the UAV
+    collected in the slot; the sum over UAVs is the team's reward. A UAV terminates with an empty
+    battery, which is at its terminal.
 
     Args:
-        mission: of `make_mission`.
-        names: of the agents, one for each UAV [uav0, uav1, …].
+        mission: mission made by `make_mission`.
+        names: names of the agents, one for each UAV [uav0, uav1, …].
     """
 
     metadata = {"name": "radiotwin_harvest_v0", "render_modes": []}
@@ -79,9 +79,9 @@ class HarvestEnv(ParallelEnv[str, Arrays, int]):
 
     def reset(self, seed: int | None = None, options: dict | None = None,
               ) -> tuple[dict[str, Arrays], dict[str, dict[str, Any]]]:
-        """Take off; see `pettingzoo.ParallelEnv`.
+        """Start a flight; see `pettingzoo.ParallelEnv`.
 
-        Without a seed the random numbers of the flights before go on; options are not used.
+        Without a seed the random generator continues; options are not used.
         """
         if seed is not None or self._rng is None:
             self._rng = np.random.default_rng(seed)
@@ -93,7 +93,7 @@ class HarvestEnv(ParallelEnv[str, Arrays, int]):
     def step(self, actions: dict[str, int]) -> tuple[
             dict[str, Arrays], dict[str, float], dict[str, bool], dict[str, bool],
             dict[str, dict[str, Any]]]:
-        """Fly one slot with an action of each agent that flies; see `pettingzoo.ParallelEnv`."""
+        """Fly one slot with an action for each flying agent; see `pettingzoo.ParallelEnv`."""
         flying = self.agents
         wanted = np.array([[actions[agent] if agent in flying else NO_OP
                             for agent in self.possible_agents]])
@@ -108,11 +108,12 @@ class HarvestEnv(ParallelEnv[str, Arrays, int]):
         return observations, rewards, terminations, dict.fromkeys(flying, False), infos
 
     def state(self) -> np.ndarray:
-        """Return the (state_size,) float32 state for a mixer."""
+        """Return the global state (state_size,) float32, see `marl.environment.global_state`."""
         return global_state(self.mission, self._environment.frame)[0]
 
     def _seen(self, agents: list[str], replaced: np.ndarray,
               ) -> tuple[dict[str, Arrays], dict[str, dict[str, Any]]]:
+        """Return observations and infos of agents; `replaced` (U,) marks infeasible actions."""
         observation, mask = observe(self.mission, self._environment.frame)
         observations, infos = {}, {}
         for u, agent in enumerate(self.possible_agents):
@@ -124,10 +125,10 @@ class HarvestEnv(ParallelEnv[str, Arrays, int]):
 
 
 def spaces(mission: Mission) -> tuple[Dict, MultiDiscrete]:
-    """Return the spaces of one flight.
+    """Return the observation and action spaces of one flight under central control.
 
-    The observation has `state`, and `observation` and `action_mask` of every UAV; the action is
-    one for every UAV.
+    An observation has `state`, and `observation` and `action_mask` of every UAV; an action has an
+    entry for every UAV.
     """
     uavs, size = mission.uavs, observation_size(mission)
     return Dict({"state": Box(-np.inf, np.inf, (state_size(mission),), np.float32),
@@ -137,16 +138,16 @@ def spaces(mission: Mission) -> tuple[Dict, MultiDiscrete]:
 
 
 class CentralVectorEnv(VectorEnv[Arrays, np.ndarray, np.ndarray]):
-    """E flights side by side; the numbers are those of `marl.environment.Environment`.
+    """Gymnasium vector environment of E parallel flights under central control.
 
-    Reward: data units that all UAVs of a flight collected in the slot. A flight terminates with
-    all batteries empty; the step after that begins it anew, whatever the action
-    (`AutoresetMode.NEXT_STEP`). Actions that are not feasible are replaced (`safe_actions`);
-    `infos["replaced"]`, (E, U) bool, says which.
+    Reward: data units that all UAVs of a flight collected in the slot. A flight terminates when all
+    batteries are empty; the next step restarts it, whatever the action
+    (`AutoresetMode.NEXT_STEP`). Infeasible actions are replaced (`safe_actions`) and marked in
+    `infos["replaced"]`, (E, U) bool.
 
     Args:
-        mission: of `make_mission`.
-        num_envs: E.
+        mission: mission made by `make_mission`.
+        num_envs: number of flights E.
     """
 
     def __init__(self, mission: Mission, num_envs: int = 1) -> None:
@@ -158,9 +159,9 @@ class CentralVectorEnv(VectorEnv[Arrays, np.ndarray, np.ndarray]):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None,
               ) -> tuple[Arrays, dict[str, Any]]:
-        """Take off with all flights; see `gymnasium.vector.VectorEnv`.
+        """Start all flights; see `gymnasium.vector.VectorEnv`.
 
-        Without a seed the random numbers of the flights before go on; options are not used.
+        Without a seed the random generator continues; options are not used.
         """
         if seed is not None or self._np_random is None:
             self._np_random, self._np_random_seed = np.random.default_rng(seed), seed
@@ -189,6 +190,7 @@ class CentralVectorEnv(VectorEnv[Arrays, np.ndarray, np.ndarray]):
         return self._environment.frame
 
     def _seen(self) -> tuple[Arrays, dict[str, Any]]:
+        """Return observations and infos of all flights."""
         frame = self.frame
         observation, mask = observe(self.mission, frame)
         mask = mask.astype(np.int8)
@@ -197,11 +199,11 @@ class CentralVectorEnv(VectorEnv[Arrays, np.ndarray, np.ndarray]):
 
 
 class CentralEnv(gymnasium.Env[Arrays, np.ndarray]):
-    """One flight; as `CentralVectorEnv`, but a flight that is over waits for `reset`.
+    """Gymnasium environment of one flight under central control, without automatic reset.
 
     Args:
-        mission: of `make_mission`.
-        scene: of the mission, for `render`.
+        mission: mission made by `make_mission`.
+        scene: scene of the mission, for `render`.
         render_mode: `rgb_array`, or None.
     """
 
@@ -214,7 +216,7 @@ class CentralEnv(gymnasium.Env[Arrays, np.ndarray]):
                              "rgb_array")
         self.render_mode, self._scene = render_mode, scene
         self._picture: FlightPicture | None = None
-        self._cells: list[np.ndarray] = []  # of the slots so far
+        self._cells: list[np.ndarray] = []  # cells (U, 2) in the slots so far
         self._flights = CentralVectorEnv(mission)
         self.observation_space, self.action_space = spaces(mission)  # type: ignore[assignment]
 
@@ -222,7 +224,7 @@ class CentralEnv(gymnasium.Env[Arrays, np.ndarray]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None,
               ) -> tuple[Arrays, dict[str, Any]]:
         super().reset(seed=seed)
-        # The generator that Gymnasium seeds is the one that is drawn from.
+        # Use the generator that Gymnasium has seeded.
         self._flights._np_random = self.np_random
         seen, infos = self._flights.reset()
         self._cells = [self._flights.frame.cell[0].astype(int)]
@@ -234,7 +236,6 @@ class CentralEnv(gymnasium.Env[Arrays, np.ndarray]):
         self._cells.append(self._flights.frame.cell[0].astype(int))
         return _first(seen), float(reward[0]), bool(terminated[0]), False, _first(infos)
 
-
     @override
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         if self.render_mode is None or self._scene is None:
@@ -245,21 +246,22 @@ class CentralEnv(gymnasium.Env[Arrays, np.ndarray]):
         return self._picture.image(np.array(self._cells), frame.assigned[0], frame.data_units[0])
 
     def action_masks(self) -> np.ndarray:
-        """Return the (U * 6,) actions that are feasible, as SB3-contrib's `MaskablePPO` asks."""
+        """Return the mask (U * 6,) of feasible actions, for SB3-contrib's `MaskablePPO`."""
         return observe(self._flights.mission, self._flights.frame)[1][0].ravel()
 
 
 def _first(values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the values of the first flight."""
     return {name: value[0] for name, value in values.items()}
 
 
 def central_env(scene: Path | str, truth: str = "traced", assignment: str = "matching",
                 render_mode: str | None = None) -> CentralEnv:
-    """Return the environment that `gymnasium.make("radiotwin/Harvest-v0", scene=…)` makes.
+    """Make a `CentralEnv`; the entry point of `gymnasium.make("radiotwin/Harvest-v0", scene=…)`.
 
     Args:
-        scene: folder.
-        truth: map that is flown in, `traced` or `segmented`; all positions are known.
+        scene: scene folder.
+        truth: map to fly in, `traced` or `segmented`; all device positions are known.
         assignment: see `make_mission`.
         render_mode: see `CentralEnv`.
     """

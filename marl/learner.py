@@ -1,4 +1,4 @@
-"""The interface of a learner: prepare in a map, then give a policy that flies.
+"""Interface of learners: `prepare` in a map, then return a `policy` that flies.
 
 To add a learner, subclass `Learner` in one file and add one line to `marl.settings.LEARNERS`, or
 an entry point to a package of one's own (example in `docs/marl.md`).
@@ -27,7 +27,7 @@ class Setup:
     Attributes:
         run: settings of the run.
         settings: settings of learning.
-        mission: gives the sizes only; its map is blank.
+        mission: mission with a blank map, for array sizes only.
         rounds: number of calls of `prepare` to come.
         device: torch device.
     """
@@ -41,38 +41,39 @@ class Setup:
 
 @dataclass
 class Flown:
-    """Flights in the map that a learner is prepared in.
+    """Counter of simulated flights and of what they collected.
 
     Attributes:
-        flights: number of them so far.
-        collected: sum of the shares of all data that they collected.
+        flights: number of flights.
+        collected: sum over flights of the share of all data collected.
     """
 
     flights: int = 0
     collected: float = 0.0
 
     def add(self, ratio: np.ndarray) -> None:
-        """Count some more, by the share that each collected."""
+        """Add flights, given the share (E,) of all data that each collected."""
         self.flights += len(ratio)
         self.collected += float(ratio.sum())
 
     @classmethod
     def of(cls, state: dict) -> "Flown":
-        """Return what `vars` gave a checkpoint."""
+        """Restore the counter from a checkpoint, which holds its `vars`."""
         require(state, {"flights": COUNT, "collected": ...})
         return cls(state["flights"], float(state["collected"]))
 
 
 class Learner(ABC):
-    """Decides where the UAVs fly.
+    """Algorithm that decides where the UAVs fly.
 
     Attributes:
-        learns: whether it trains; only then can it be guided and compared over maps.
+        learns: whether it trains; only such learners are compared over maps.
         uses_map: whether its flights depend on the map that it is prepared in.
-        believes: whether it asks what the twin leaves open (`believe`).
-        replicas: copies that simulate `run.episodes` episodes each in a round.
-        training: flights that it has trained with so far.
-        selection: flights flown in `prepare` so far to choose between policies.
+        believes: whether it uses the twin's uncertainty (`believe`).
+        mission: in the map in which it was prepared last; before, the setup's.
+        replicas: number of copies that simulate `run.episodes` episodes each in a round.
+        training: training flights so far.
+        selection: flights so far that chose between policies.
     """
 
     learns: ClassVar[bool] = True
@@ -80,48 +81,51 @@ class Learner(ABC):
     believes: ClassVar[bool] = False
 
     def __init__(self, setup: Setup) -> None:
-        self.setup = setup
+        self.setup, self.mission = setup, setup.mission
         self.replicas = 1 if self.learns else 0
         self.training, self.selection = Flown(), Flown()
 
     def believe(self, prior: "Prior | None") -> None:  # noqa: B027  most ask for none
-        """Take what the twin leaves open, before `prepare`; None: there is no twin."""
+        """Receive the twin's uncertainty before `prepare`; None: there is no twin."""
 
-    @abstractmethod
     def prepare(self, mission: Mission,
                 on_progress: Callable[[int], None]) -> list[dict[str, float]]:
-        """Learn, or plan, in the map of a mission.
+        """Learn, or plan, in the map of a mission; by default only keep the mission.
 
         Args:
-            mission: the twin's, or the truth's.
+            mission: in the map of the twin, or of the truth.
             on_progress: called with the number of episodes simulated since the last call.
 
         Returns:
-            One record to be logged for each block of episodes: metric -> value. `episodes` is
+            One record for each block of episodes, to be logged: metric -> value. `episodes` is
             the number of episodes simulated up to the end of the block.
         """
+        self.mission = mission
+        return []
 
     @abstractmethod
     def policy(self, rng: np.random.Generator) -> Policy:
-        """Return the learned or planned policy, without exploration."""
+        """Return the learned or planned policy, without exploration; `rng` is for its decisions."""
 
     def state(self, last: bool) -> dict:
-        """Return a checkpoint: nested dicts and lists of numbers, texts, arrays and tensors.
+        """Return the state for a checkpoint: nested dicts and lists of numbers, texts and arrays.
+
+        An empty state means that `prepare` restores the learner from the twin.
 
         Args:
-            last: `prepare` will not be called again, so only the policy is needed.
+            last: whether `prepare` will not be called again, so that the policy suffices.
         """
         return {}
 
     def load_state(self, state: dict) -> None:  # noqa: B027  most have something to restore
-        """Go on from a checkpoint."""
+        """Restore the learner from a checkpoint's state."""
 
     def close(self) -> None:  # noqa: B027  most have nothing to release
-        """Release processes."""
+        """Stop worker processes."""
 
 
 def make_learner(run: RunSettings, settings: LearnerSettings, mission: Mission, rounds: int,
                  device: str = "cpu") -> Learner:
-    """Make the learner that `run.algorithm` names; the mission's map is hidden from it."""
+    """Construct the learner named by `run.algorithm`; the mission's map is blanked for it."""
     blank = mission._replace(snr_db=np.full_like(mission.snr_db, -np.inf))
     return learner_class(run.algorithm)(Setup(run, settings, blank, rounds, device))

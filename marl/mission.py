@@ -1,4 +1,4 @@
-"""The mission as arrays: the map, the data to collect, and the knowledge of the UAVs."""
+"""The mission as arrays: SNR maps, batteries, data to collect, known positions."""
 
 import math
 from collections.abc import Iterable
@@ -19,40 +19,39 @@ MOVES = np.array([(0, 0), (1, 0), (0, -1), (-1, 0), (0, 1), (0, 0)], dtype=np.in
 """(row, column) of each action."""
 COSTS = np.array([1, *[round(MOVE_COST / HOVER_COST)] * 4, 0], dtype=np.int64)
 """Battery cost of each action, in whole hovers, so that the battery is counted exactly."""
-MAX_HOVERS = 20_000  # of a battery, which is counted in 16 bits
-# Of what is plausible: beyond it, sums in single precision are no numbers.
+MAX_HOVERS = 20_000  # largest battery, which is stored in 16 bits [hovers]
+# Plausible limits; larger values would overflow in single precision.
 MAX_SNR_DB, MAX_GAIN_DB, MAX_SIGMA_DB = 1e4, 1e3, 100.0
 MAX_UNITS, MAX_SLOT_S = 1e9, 1e6
 
 
 class Mission(NamedTuple):
-    """All that a flight depends on; U UAVs, K devices, a lattice of ny x nx cells at L levels.
+    """Inputs of a flight: U UAVs, K devices, a lattice of ny x nx cells at L levels.
 
-    A tuple of arrays, because compiled functions take it as it is.
+    It is a tuple of arrays, so that compiled functions accept it.
 
     Attributes:
-        snr_db: (L, K, ny, nx) float32 mean SNR [dB]; -inf where nothing is ever received.
+        snr_db: (L, K, ny, nx) float32 mean SNR [dB]; -inf = never received.
         sigma_db: (L, K, ny, nx) float32 standard deviation of the shadowing [dB].
         steps_home: (U, ny, nx) int64 moves to the UAV's terminal.
-        start: (U, 2) int64 cell (row, column) where each UAV starts.
-        battery: (U,) int64 at take-off, in hovers (half battery units).
-        level: (U,) int64 the level of the maps at which each UAV flies.
-        altitude_m: (U,) [m]
-        data_units: (K,) float64 waiting at each device.
-        known_m: (K, 2) float64 horizontal positions of the devices as the UAVs know them, relative
-            to the lattice's south-west corner [m]; NaN where unknown. They decide what agents see,
-            never what they receive.
+        start: (U, 2) int64 start cell (row, column) of each UAV.
+        battery: (U,) int64 battery at take-off [hovers = half battery units].
+        level: (U,) int64 level of the maps at which each UAV flies.
+        altitude_m: (U,) altitude of each UAV [m].
+        data_units: (K,) float64 data at each device.
+        known_m: (K, 2) float64 horizontal positions of the devices as known to the UAVs, relative
+            to the lattice's south-west corner [m]; NaN if unknown. They enter observations only.
         step_m: lattice step [m].
         rate_scale: data units per slot and bit/s/Hz.
         threshold_db: least SNR of a usable link [dB].
         detection_db: SNR below which a receiver does not detect anything [dB].
         uav_link_db: (2,) SNR between two UAVs at 1 m [dB], and its slope per decade of distance
             (the LoS law).
-        max_rate: whether a UAV that loses its best device to another one idles (the paper's
-            Eq. 8); otherwise the strongest remaining pair is matched until none is left.
-        shadowing_share: share of the shadowing's variance that stays for a flight; the rest is
-            drawn anew in every slot.
-        shadowing_m: distance over which the correlation of the part that stays falls to 1/e [m].
+        max_rate: whether a UAV that loses its best device idles (the paper's Eq. 8); otherwise it
+            gets the strongest remaining device.
+        shadowing_share: share of the shadowing's variance that lasts for a flight; the rest is
+            drawn in every slot.
+        shadowing_m: distance at which the correlation of the lasting part is 1/e [m].
     """
 
     snr_db: np.ndarray
@@ -85,47 +84,47 @@ class Mission(NamedTuple):
 
     @property
     def longest(self) -> int:
-        """Slots of the longest possible flight, which hovers until the battery is empty."""
+        """Slots of the longest possible flight: hovering until the largest battery is empty."""
         return int(self.battery.max())
 
 
 @dataclass(frozen=True)
 class Known:
-    """Positions of the devices as the UAVs know them.
+    """Device positions that the UAVs know.
 
     Attributes:
-        position_m: device -> (x, y) [m]; devices without a known position are missing.
+        position_m: (x, y) by device [m]; devices without a known position are missing.
     """
 
     position_m: dict[str, tuple[float, float]]
 
     @classmethod
     def of(cls, devices: Iterable[Any]) -> "Known":
-        """Return the positions of `Twin.devices`, or of a scene's, where they are known."""
+        """Return the finite positions of a twin's or a scene's devices."""
         return cls({d.device: (d.x_m, d.y_m) for d in devices
                     if np.isfinite([d.x_m, d.y_m]).all()})
 
     @classmethod
     def truth(cls, scene: Scene) -> "Known":
-        """Return all true positions: more than a real UAV knows."""
+        """Return the true positions of all devices, which a real UAV does not know."""
         return cls.of(scene.config.devices)
 
     @classmethod
     def anchors(cls, scene: Scene) -> "Known":
-        """Return the positions that are known before the first flight."""
+        """Return the positions of the anchors, which are known before the first flight."""
         return cls.of(d for d in scene.config.devices if d.role == "anchor")
 
 
 def levels_of(scene: Scene) -> np.ndarray:
-    """Return the (U,) level of the lattice that each UAV of a scene flies on."""
+    """Return the lattice level (U,) nearest to each UAV's altitude."""
     return np.array([int(np.abs(scene.lattice.z_m - uav.altitude_m).argmin())
                      for uav in scene.config.uavs])
 
 
 def snr_offset_db(scene: Scene, radio_map: RadioMap) -> np.ndarray:
-    """Return the (K,) SNR of each device of a scene less its gain in a map [dB].
+    """Return the SNR minus the gain of each device (K,) of a scene [dB]: transmit power - noise.
 
-    Transmit powers that the map does not know are the scene's.
+    The transmit power is the map's, or else the scene's.
     """
     radio, powers_dbm = scene.config.radio, radio_map.tx_power_dbm
     return np.array([powers_dbm.get(device.device, radio.tx_power_dbm)
@@ -134,18 +133,17 @@ def snr_offset_db(scene: Scene, radio_map: RadioMap) -> np.ndarray:
 
 def make_mission(scene: Scene, radio_map: RadioMap, known: Known, assignment: str = "matching",
                  keep_out: np.ndarray | None = None) -> Mission:
-    """Return the mission of a scene in a radio map: the truth's, or a twin's.
+    """Combine a scene and a radio map (the truth's, or a twin's) into a mission.
 
     Args:
-        scene: its UAVs, radio, batteries and data; the buildings keep UAVs out.
-        radio_map: over the scene's lattice. A device that it lacks is never heard, and nothing
-            below the scene's sensitivity is. A transmit power that it does not know is the scene's.
-            Its `sigma_db`, if any, is the standard deviation of shadowing that is drawn in every
-            slot; with the attributes `shadowing_share` and `shadowing_length_m` (see
-            `radiotwin.twin.shadowing`) a part of it stays for a flight.
-        known: positions that the agents see.
+        scene: scene with UAVs, radio, batteries, data and buildings.
+        radio_map: map over the scene's lattice. Devices that it lacks are never received. Its
+            `sigma_db`, if any, is the standard deviation of shadowing; with the attributes
+            `shadowing_share` and `shadowing_length_m` (`radiotwin.twin.shadowing`) a part of it
+            lasts for a flight.
+        known: device positions that agents observe.
         assignment: `matching` or `max-rate`.
-        keep_out: (nz, ny, nx) bool, where no UAV may be; None: inside buildings alone.
+        keep_out: (nz, ny, nx) bool, closed positions besides the insides of buildings; None: none.
 
     Raises:
         BadInput: no UAV, no device, a map of another lattice or with impossible attributes, or a
@@ -193,6 +191,7 @@ def make_mission(scene: Scene, radio_map: RadioMap, known: Known, assignment: st
 
 
 def _check(scene: Scene, radio_map: RadioMap, assignment: str) -> None:
+    """Refuse scenes and maps of which no mission can be made, BadInput."""
     config, lattice, path = scene.config, scene.lattice, scene.folder / "scene.toml"
     if assignment not in ("matching", "max-rate"):
         raise BadInput(f"assignment {assignment!r} is unknown; allowed are matching, max-rate")
@@ -226,7 +225,7 @@ def _check(scene: Scene, radio_map: RadioMap, assignment: str) -> None:
 
 
 def _check_values(device: str, name: str, values: np.ndarray, low: float, high: float) -> None:
-    """Refuse values of a device's map that no radio has; NaN is none."""
+    """Refuse values of a device's map outside plausible limits; NaN is allowed."""
     wrong = values[~(np.isnan(values) | ((values >= low) & (values <= high)))]
     if len(wrong):
         raise BadInput(f"the radio map's {name} of {device} is {wrong[0]:g} somewhere; allowed are "
@@ -238,7 +237,7 @@ def _number(value: object) -> bool:
 
 
 def _ends(scene: Scene, uav: UavConfig, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the start cell, and the (ny, nx) moves home over the cells that are allowed."""
+    """Return a UAV's start cell (2,), and the moves home (ny, nx) over allowed cells (ny, nx)."""
     lattice = scene.lattice
     start, terminal = ((round((y_m - lattice.y_m[0]) / lattice.step_m),
                         round((x_m - lattice.x_m[0]) / lattice.step_m))

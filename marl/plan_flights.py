@@ -1,4 +1,4 @@
-"""From a twin to planned flights: who flies, over which devices, where, and what that brings."""
+"""Plan flights over a twin's map (`radiotwin plan`): scene, mission, plan, predicted share."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -19,28 +19,28 @@ from radiotwin.scene import Scene
 from radiotwin.scene.config import ANTENNA_HEIGHT_M, DeviceConfig, UavConfig
 from radiotwin.twin import Twin
 
-MAX_COUNTS = 8  # numbers of UAVs that a sizing tries, up to twice those of the mission
-BATTERIES = (0.5, 0.75, 1.0, 1.5, 2.0)  # that a sizing tries, times that of the mission
+MAX_COUNTS = 8  # numbers of UAVs that a sizing tries, up to twice the mission's
+BATTERIES = (0.5, 0.75, 1.0, 1.5, 2.0)  # batteries that a sizing tries, times the mission's
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlanSettings:
-    """What is asked of a plan.
+    """Settings of a plan.
 
     Attributes:
         uavs: number of UAVs, copies of the scene's in turn; None: those of the scene.
-        battery: of each, in moves; None: that of the scene.
-        base_m: (x, y) where all start and end [m]; None: as the scene has it.
-        data: table with columns `device` and `data_units`; None: that of the scene.
+        battery: battery of each UAV [moves]; None: the scene's.
+        base_m: (x, y) of start and terminal of all UAVs [m]; None: the scene's.
+        data: table with columns `device` and `data_units`; None: the scene's data.
         silent: probability that a device does not transmit.
-        data_spread: data are evenly from (1 - this) to (1 + this) times what is given.
+        data_spread: relative half-width of the uniform distribution of each device's data.
         areas: no-fly areas in the scene's frame.
         clearance_m: distance that UAVs keep from buildings [m].
-        sizes: whether to find how many UAVs and which battery collect the wanted share.
-        wanted: share of the data.
-        worlds: that a plan is flown in.
-        iterations: plans that a search tries.
-        seed: of all random numbers.
+        sizes: whether to evaluate other numbers of UAVs, batteries and bases.
+        wanted: wanted share of the data.
+        worlds: number of worlds in which a plan is evaluated.
+        iterations: plans tried in a search.
+        seed: random seed.
     """
 
     uavs: int | None = None
@@ -60,14 +60,14 @@ class PlanSettings:
 
 @dataclass(frozen=True, eq=False)
 class PlannedFlights:
-    """A plan, and what it was made of.
+    """A plan with its inputs and predicted share of data.
 
     Attributes:
-        scene: with the UAVs that fly, and the devices where the twin has them.
-        mission: in the twin.
-        prior: what the twin believes.
-        promised: the plan, and what it collects.
-        sizes: of the sizing; empty where it was not asked for.
+        scene: scene with the UAVs that fly, and with the twin's device positions.
+        mission: mission in the twin's map.
+        prior: uncertainty of the twin.
+        promised: the plan, and the shares that it collects in possible worlds.
+        sizes: result of the sizing; empty if it was not requested.
     """
 
     scene: Scene
@@ -79,17 +79,17 @@ class PlannedFlights:
 
 def plan_flights(twin: Twin, scene: Scene, settings: PlanSettings,
                  on_progress: Callable[..., None] = lambda *_: None) -> PlannedFlights:
-    """Plan flights over a twin's map.
+    """Plan flights over a twin's map, and predict the share of data that they collect.
 
     Args:
-        twin: its map, its devices and its errors.
-        scene: the city and the lattice; its UAVs, unless the settings have a base.
-        settings: what is asked.
-        on_progress: called with the per cent of the work done since, and what is done now.
+        twin: twin with device positions and errors.
+        scene: scene with buildings, lattice and UAVs.
+        settings: settings of the plan.
+        on_progress: called with the per cent of the work done since the last call, and with a text.
 
     Raises:
-        BadInput: no UAV, a battery that reaches nowhere, a base that is blocked, a table of data
-            that cannot be used, or a twin of another map.
+        BadInput: no UAV, a battery that does not reach the terminal, a blocked base, an unusable
+            table of data, or a twin of another map.
     """
     flown = planned_scene(scene, twin, settings)
     on_progress(0, "predicting the map")
@@ -117,10 +117,10 @@ def plan_flights(twin: Twin, scene: Scene, settings: PlanSettings,
 
 
 def planned_scene(scene: Scene, twin: Twin, settings: PlanSettings) -> Scene:
-    """Return a scene with the devices of a twin where it has them, and the UAVs that fly.
+    """Return a scene with a twin's devices at its positions, and with the UAVs that fly.
 
     Raises:
-        BadInput: no UAV, or a table of data that cannot be used.
+        BadInput: no UAV, or an unusable table of data.
     """
     declared = {device.device: device for device in scene.config.devices}
     data = {} if settings.data is None else _read_data(settings.data,
@@ -130,7 +130,7 @@ def planned_scene(scene: Scene, twin: Twin, settings: PlanSettings) -> Scene:
     for each in twin.devices:
         known = bool(np.isfinite([each.x_m, each.y_m]).all())
         given = declared.get(each.device)
-        # Not checked again: a device may be outside the extent, or nowhere.
+        # Not validated: a device may be outside the extent or without a position.
         devices.append(DeviceConfig.model_construct(
             device=each.device, x_m=each.x_m if known else (x_min + x_max) / 2,
             y_m=each.y_m if known else (y_min + y_max) / 2,
@@ -141,7 +141,7 @@ def planned_scene(scene: Scene, twin: Twin, settings: PlanSettings) -> Scene:
 
 
 def _read_data(path: Path, names: list[str]) -> dict[str, float]:
-    """Return the data units of a table's devices, which are all of the twin's."""
+    """Read data units by device from a table; devices must be among the twin's `names`."""
     cells = read_cells(path, ("device", "data_units"), ())
     device, text = (as_text(cells[name]).fillna("").str.strip()
                     for name in ("device", "data_units"))
@@ -156,8 +156,8 @@ def _read_data(path: Path, names: list[str]) -> dict[str, float]:
 
 
 def _uavs(scene: Scene, settings: PlanSettings) -> list[UavConfig]:
-    """Return the UAVs that fly: the scene's or copies of them, with battery and base as given."""
-    own, lattice = scene.config.uavs, scene.lattice
+    """Return the UAVs that fly: the scene's or copies, with battery and base of the settings."""
+    templates, lattice = scene.config.uavs, scene.lattice
     path = scene.folder / "scene.toml"
     changes: dict[str, float] = {}
     if settings.battery is not None:
@@ -170,17 +170,17 @@ def _uavs(scene: Scene, settings: PlanSettings) -> list[UavConfig]:
                            f"lattice of {path} (x {lattice.x_m[0]:g} to {lattice.x_m[-1]:g} m, y "
                            f"{lattice.y_m[0]:g} to {lattice.y_m[-1]:g} m); give a place in it")
         changes |= {"start_x_m": x_m, "start_y_m": y_m, "terminal_x_m": x_m, "terminal_y_m": y_m}
-    if not own:
+    if not templates:
         if settings.base_m is None or settings.battery is None:
             raise BadInput(f"{path} has no [[uavs]], so it is not known who flies; add them, or "
                            "give --base X,Y, --battery MOVES and --uavs N")
-        own = [UavConfig(uav=f"uav{number}", altitude_m=altitude_m, battery=settings.battery,
-                         start_x_m=0.0, start_y_m=0.0, terminal_x_m=0.0, terminal_y_m=0.0)
-               for number, altitude_m in enumerate(lattice.z_m.tolist())]
-    count = settings.uavs or (len(own) if scene.config.uavs else 1)
+        templates = [UavConfig(uav=f"uav{number}", altitude_m=altitude_m, battery=settings.battery,
+                               start_x_m=0.0, start_y_m=0.0, terminal_x_m=0.0, terminal_y_m=0.0)
+                     for number, altitude_m in enumerate(lattice.z_m.tolist())]
+    count = settings.uavs or (len(templates) if scene.config.uavs else 1)
     found = []
     for number in range(count):
-        copy, lap = own[number % len(own)], number // len(own)
+        copy, lap = templates[number % len(templates)], number // len(templates)
         name = copy.uav if not lap else f"{copy.uav}-{lap + 1}"
         found.append(copy.model_copy(update=changes | {"uav": name}))
     return found

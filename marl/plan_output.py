@@ -1,4 +1,4 @@
-"""What `radiotwin plan` writes: the promise as JSON, files that fly, and pictures."""
+"""Write the folder of `radiotwin plan`: plan.json, flight files and figures."""
 
 import json
 from dataclasses import asdict
@@ -23,14 +23,13 @@ FILES = frozenset({"plan.json", "plan.png", "sizes.png", "flights.csv", "flights
 
 
 def routes(scene: Scene, mission: Mission, actions: np.ndarray) -> list[Route]:
-    """Return the route of each UAV of a plan (T, U)."""
+    """Convert the actions (T, U) of a plan to the route of each UAV, for flight files."""
     lattice, slot_s = scene.lattice, scene.config.mission.slot_s
     positions_m = lattice.positions_m.reshape(*lattice.shape, 3)
     speed_m_s = lattice.step_m / slot_s
     found = []
     for u, (uav, level) in enumerate(zip(scene.config.uavs, levels_of(scene), strict=True)):
-        mine = actions[:, u]
-        flown = mine[COSTS[mine] > 0]
+        flown = actions[:, u][COSTS[actions[:, u]] > 0]
         cells = mission.start[u] + np.concatenate([np.zeros((1, 2), int),
                                                    np.cumsum(MOVES[flown], axis=0)])
         track_m = positions_m[level, cells[:, 0], cells[:, 1]]
@@ -43,10 +42,10 @@ def write_plan(folder: Path, planned: PlannedFlights, wanted: float, facts: dict
     """Write the folder of a plan.
 
     Args:
-        folder: that exists.
+        folder: existing folder.
         planned: the plan.
-        wanted: share of the data that is wanted.
-        facts: for `plan.json`, besides what the plan says itself.
+        wanted: wanted share of the data.
+        facts: further entries of `plan.json`.
 
     Returns:
         Names of the files.
@@ -77,15 +76,16 @@ def write_plan(folder: Path, planned: PlannedFlights, wanted: float, facts: dict
 
 
 def sizes_figure(sizes: list[Size], wanted: float) -> Figure:
-    """Draw the share collected, P10 to P90, against the battery, a line for each number of UAVs."""
+    """Draw the collected share (P50, P10 to P90) against battery, by number of UAVs and base."""
     base_names = list(dict.fromkeys(row.base for row in sizes))
     figure = Figure(figsize=(5.2 * len(base_names), 4.6), layout="constrained")
     FigureCanvasAgg(figure)
     for axes, base in zip(figure.subplots(1, len(base_names), squeeze=False, sharey=True)[0],
                           base_names, strict=True):
-        mine = [row for row in sizes if row.base == base]
-        for number, uavs in enumerate(sorted({row.uavs for row in mine})):
-            rows = sorted((row for row in mine if row.uavs == uavs), key=lambda row: row.battery)
+        of_base = [row for row in sizes if row.base == base]
+        for number, uavs in enumerate(sorted({row.uavs for row in of_base})):
+            rows = sorted((row for row in of_base if row.uavs == uavs),
+                          key=lambda row: row.battery)
             battery, p10, p50, p90 = np.array([[row.battery, row.p10, row.p50, row.p90]
                                                for row in rows]).T
             colour = COLOURS[number % len(COLOURS)]

@@ -1,7 +1,7 @@
 """Planning without learning: simulated annealing over waypoints, scored by the mission's rules.
 
-The planner needs the radio map alone: where a device is does not matter, only where it is heard.
-Shadowing enters by its expectation: each slot counts with its mean data.
+The planner needs only the radio map, not the positions of devices. Shadowing is averaged: each slot
+counts with its expected data.
 """
 
 from collections.abc import Callable
@@ -22,21 +22,21 @@ from marl.tours import change
 from radiotwin.runtime.compiled import njit
 from radiotwin.runtime.console import progress
 
-LEAST_WAYPOINTS, HOVERS_PER_WAYPOINT = 8, 12  # so many waypoints a tour has at most
-# Temperatures of the annealing, in collected share times devices
+LEAST_WAYPOINTS, HOVERS_PER_WAYPOINT = 8, 12  # limit of a tour: max(8, battery in hovers / 12)
+# Temperatures of the annealing [collected share times number of devices]
 START_TEMPERATURE, REHEAT_TEMPERATURE, END_TEMPERATURE = 0.2, 0.03, 0.003
-STARTS, REHEATS = 5, 10  # of a search: at most so often it begins anew, then improves the best
-TRIES_OF_A_START = 5000  # at least, for each UAV
-STARTS_SHARE = 1 / 2  # of the tried plans
+STARTS, REHEATS = 5, 10  # searches from an empty tour (at most); then from the best tour
+TRIES_OF_A_START = 5000  # least number of tries of a start, for each UAV
+STARTS_SHARE = 1 / 2  # share of the tries that the starts get
 CHUNK = 5000  # iterations between updates of the progress bar
 
 
 class Plan(NamedTuple):
-    """An open-loop plan.
+    """An open-loop plan for all UAVs.
 
     Attributes:
         actions: (T, U) int8; feasible from take-off until all batteries are empty.
-        ratio: expected share of the data that it collects in the map that it was planned in.
+        ratio: expected share of the data collected, in the map of the plan.
         tour: (U, W, 3) int64 waypoints (row, column, hovers) that the actions follow.
         visits: (U,) int64 number of waypoints of each UAV.
     """
@@ -52,10 +52,10 @@ class TourFlight(NamedTuple):
 
     Attributes:
         cell: (U, 2) int64 row and column.
-        battery: (U,) int64 hovers that are left.
-        left: (K,) data units that are expected to be left.
-        reached: (U,) int64 waypoints that each UAV has passed.
-        hovered: (U,) int64 hovers flown at the next waypoint.
+        battery: (U,) int64 left [hovers].
+        left: (K,) expected data units left at each device.
+        reached: (U,) int64 number of waypoints that each UAV has passed.
+        hovered: (U,) int64 hovers done at the next waypoint.
         strength, assigned, mask: (U, K), (U,) and (6,) scratch.
     """
 
@@ -70,14 +70,14 @@ class TourFlight(NamedTuple):
 
 
 class Candidates(NamedTuple):
-    """Devices in reach of each cell, the strongest link first; a cell is listed when it is needed.
+    """Devices in reach of each cell, the strongest link first; filled when a cell is first used.
 
     Attributes:
-        value: (L, K, ny, nx) float32, of `expected_data`.
+        value: (L, K, ny, nx) float32 data units a slot, see `expected_data`.
         peak: (L, K, 2) int64 cell (row, column) where each device is heard best.
-        listed: (P,) bool; a place is a cell at a level, number (level * ny + row) * nx + column.
-        device: (P, K) int32
-        worth: (P, K) float32 data units of a slot; 0 after the last device in reach.
+        listed: (P,) bool, whether the place is filled; place = (level * ny + row) * nx + column.
+        device: (P, K) int32 devices, the strongest first.
+        worth: (P, K) float32 data units a slot of these devices; 0 beyond reach.
     """
 
     value: np.ndarray
@@ -88,7 +88,7 @@ class Candidates(NamedTuple):
 
     @classmethod
     def of(cls, value: np.ndarray) -> "Candidates":
-        """Return lists that searches in one map can share, all still to be filled."""
+        """Return empty lists for a map, which several searches can share."""
         levels, devices, rows, columns = value.shape
         strongest = value.reshape(levels, devices, -1).argmax(axis=2)
         shape = (levels * rows * columns, devices)
@@ -98,13 +98,13 @@ class Candidates(NamedTuple):
 
 
 class Course(NamedTuple):
-    """A flight along tours slot by slot, from which one along a changed tour can branch off.
+    """Simulated flight along tours, slot by slot, so that a changed tour is simulated only partly.
 
     Attributes:
-        place: (T, U) int32 of `Candidates` at the beginning of each slot; -1 after landing.
-        battery: (U, T) int32 [hovers]
-        since: (U, W + 1) int32 slot from which on the UAV has passed so many waypoints.
-        device: (T, U) int32 that is expected to serve the UAV; -1 for none.
+        place: (T, U) int32 place (see `Candidates`) at the beginning of each slot; -1 when landed.
+        battery: (U, T) int32 battery left [hovers].
+        since: (U, W + 1) int32 first slot in which the UAV has passed 0, 1, … W waypoints.
+        device: (T, U) int32 device assigned to the UAV; -1 for none.
         before: (T, U) data units left at that device before the slot.
         left: (K,) data units left at the end.
     """
@@ -118,7 +118,7 @@ class Course(NamedTuple):
 
     @classmethod
     def of(cls, mission: Mission, waypoints: int) -> "Course":
-        """Return a course of UAVs that have not taken off, with tours of so many waypoints."""
+        """Return an empty course for tours of up to `waypoints` waypoints."""
         slots, uavs = mission.longest, mission.uavs
         return cls(np.full((slots, uavs), -1, np.int32), np.zeros((uavs, slots), np.int32),
                    np.zeros((uavs, waypoints + 1), np.int32), np.full((slots, uavs), -1, np.int32),
@@ -126,7 +126,7 @@ class Course(NamedTuple):
 
 
 class PlanPolicy:
-    """Fly the (T, U) actions of a plan, the same in all flights."""
+    """Policy that flies the actions (T, U) of a plan in all flights."""
 
     def __init__(self, actions: np.ndarray) -> None:
         self._actions = actions
@@ -143,7 +143,7 @@ class PlanPolicy:
 
 
 class Planner(Learner):
-    """`--algorithm planner`: search a plan in the map and fly it as it is."""
+    """`--algorithm planner`: search a plan in the map, and fly it open-loop."""
 
     learns = False
 
@@ -173,13 +173,13 @@ class Planner(Learner):
 
 
 def plan(mission: Mission, iterations: int, seed: int, value: np.ndarray | None = None) -> Plan:
-    """Search a plan in the map that is known: a few times from nothing, then from the best again.
+    """Search a plan by annealing: a few times from empty tours, then repeatedly from the best.
 
     Args:
-        mission: with the map.
-        iterations: plans that are tried in all.
-        seed: of the search.
-        value: data expected of a slot, in place of `expected_data` of the map.
+        mission: mission with the map.
+        iterations: total number of plans to try.
+        seed: random seed of the search.
+        value: (L, K, ny, nx) expected data units a slot; None: `expected_data(mission)`.
     """
     rng = stream(seed, "planning")
     candidates = Candidates.of(expected_data(mission) if value is None else value)
@@ -209,19 +209,19 @@ def improve(mission: Mission, value: np.ndarray, tour: np.ndarray, count: np.nda
             temperature: float = START_TEMPERATURE / 10,
             on_progress: Callable[[int], None] = lambda _: None,
             candidates: Candidates | None = None) -> Plan:
-    """Continue the search from a tour.
+    """Improve tours by simulated annealing.
 
     Args:
-        mission: cells and batteries of the UAVs, and the data believed to be left at the devices.
-        value: `expected_data` of its map.
-        tour: see `Plan`; not changed.
-        count: visits of `Plan`; not changed.
-        iterations: plans that are tried.
-        rng: of the search.
-        only: UAV whose tour is changed while the others keep theirs; -1 for all.
-        temperature: at the start, in collected share.
+        mission: present cells and batteries of the UAVs, and data left at the devices.
+        value: (L, K, ny, nx) expected data units a slot, see `expected_data`.
+        tour: tours to start from, see `Plan`; not changed.
+        count: visits, see `Plan`; not changed.
+        iterations: number of plans to try.
+        rng: generator of the search.
+        only: the only UAV whose tour is changed; -1: all.
+        temperature: initial temperature [collected share].
         on_progress: called with the number of plans tried since the last call.
-        candidates: of the same value, from an earlier search; None: made here.
+        candidates: lists of an earlier search with the same value; None: new ones.
     """
     tour, count = tour.copy(), count.copy()
     best_tour, best_count = tour.copy(), count.copy()
@@ -245,20 +245,20 @@ def improve(mission: Mission, value: np.ndarray, tour: np.ndarray, count: np.nda
 
 
 def expected_data(mission: Mission) -> np.ndarray:
-    """Return the data units (L, K, ny, nx) float32 that one slot on each link is expected to bring.
+    """Return the expected data units (L, K, ny, nx) float32 of one slot on each link.
 
-    The probability that the SNR reaches the threshold times the rate at the mean SNR of the cases
-    in which it does.
+    It is the probability that the SNR reaches the threshold times the rate at the mean SNR above
+    the threshold.
     """
     value = np.empty(mission.snr_db.shape, np.float32)
     least_db = max(mission.threshold_db, mission.detection_db)
-    for links in np.ndindex(value.shape[:2]):  # one after the other takes less memory
+    for links in np.ndindex(value.shape[:2]):  # one device at a time, to save memory
         mean_db = mission.snr_db[links].astype(float)
         sigma_db = np.maximum(mission.sigma_db[links].astype(float), 1e-6)
         short = np.clip((least_db - mean_db) / sigma_db, -40.0, 40.0)
         chance = np.where(mission.sigma_db[links] > 0, ndtr(-short), mean_db >= least_db)
-        # Mean of a normal distribution above a threshold; density and tail in logarithms, because
-        # both may vanish.
+        # Mean of a normal distribution above a threshold; density and tail probability are taken as
+        # logarithms, since both may underflow.
         hazard = np.exp(-short**2 / 2 - np.log(2 * np.pi) / 2 - log_ndtr(-short))
         usable_db = np.where(np.isfinite(mean_db), mean_db, 0) + sigma_db * hazard
         data = mission.rate_scale * np.log2(1 + 10 ** (np.minimum(usable_db, 300.0) / 10))
@@ -267,8 +267,9 @@ def expected_data(mission: Mission) -> np.ndarray:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _towards(row: int, column: int, to_row: int, to_column: int, mask: np.ndarray) -> int:
-    """Return a feasible move towards a cell, along the larger axis if possible; NO_OP for none."""
+def _move_towards_cell(row: int, column: int, to_row: int, to_column: int,
+                       mask: np.ndarray) -> int:
+    """Return a feasible move towards a cell, along the larger axis if possible, or NO_OP."""
     north_south = NORTH if to_row > row else SOUTH
     east_west = EAST if to_column > column else WEST
     first, second = north_south, east_west
@@ -284,13 +285,25 @@ def _towards(row: int, column: int, to_row: int, to_column: int, mask: np.ndarra
 @njit(cache=True, nogil=True, error_model="numpy")
 def next_action(mission: Mission, uav: int, row: int, column: int, battery: int, tour: np.ndarray,
                 count: int, reached: int, hovered: int, mask: np.ndarray) -> tuple[int, int, int]:
-    """Follow a tour; at its end, or for lack of battery, stay as long as possible, then go home.
+    """Return the next action of a UAV that follows a tour.
 
-    The tour (W, 3) has `count` waypoints; the UAV has passed `reached` of them, and has
-    hovered so long at the next one. `battery` is in hovers, `mask` (6,) is scratch.
+    At the tour's end, or if the next waypoint is infeasible, the UAV hovers while it can, then
+    flies home.
+
+    Args:
+        mission: mission of the UAV.
+        uav: its number.
+        row: row of its cell.
+        column: column of its cell.
+        battery: battery left [hovers].
+        tour: (W, 3) waypoints (row, column, hovers).
+        count: number of waypoints.
+        reached: number of waypoints passed.
+        hovered: hovers done at the next waypoint.
+        mask: (6,) scratch.
 
     Returns:
-        Action, and the new `reached` and `hovered`.
+        action, and the new `reached` and `hovered`.
     """
     feasible(mission, uav, row, column, battery, mask)
     while reached < count:
@@ -299,7 +312,7 @@ def next_action(mission: Mission, uav: int, row: int, column: int, battery: int,
             if hovered < tour[reached, 2] and mask[HOVER]:
                 return HOVER, reached, hovered + 1
         else:
-            action = _towards(row, column, to_row, to_column, mask)
+            action = _move_towards_cell(row, column, to_row, to_column, mask)
             if action != NO_OP:
                 return action, reached, hovered
         reached, hovered = reached + 1, 0
@@ -316,7 +329,7 @@ def next_action(mission: Mission, uav: int, row: int, column: int, battery: int,
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def take_off(mission: Mission, devices: int) -> TourFlight:
-    """Return the state before the first slot."""
+    """Return the state of all UAVs at their starts, before the first slot."""
     uavs = len(mission.battery)
     return TourFlight(mission.start.copy(), mission.battery.copy(), mission.data_units.copy(),
                       np.zeros(uavs, np.int64), np.zeros(uavs, np.int64),
@@ -327,7 +340,7 @@ def take_off(mission: Mission, devices: int) -> TourFlight:
 @njit(cache=True, nogil=True, error_model="numpy")
 def fly_on(mission: Mission, value: np.ndarray, tour: np.ndarray, count: np.ndarray,
            flight: TourFlight, actions: np.ndarray) -> None:
-    """Fly as many slots along the tours as `actions` (T, U) has rows, with the expected data."""
+    """Fly T slots along the tours with the expected data; write the `actions` (T, U)."""
     cell, battery, left, reached, hovered, strength, assigned, mask = flight
     uavs, devices = strength.shape
     for slot in range(len(actions)):
@@ -353,9 +366,9 @@ def fly_on(mission: Mission, value: np.ndarray, tour: np.ndarray, count: np.ndar
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _list(candidates: Candidates, level: int, row: int, column: int, place: int) -> None:
-    """List the devices that are heard at a place."""
+    """Fill the list of devices in reach of a place, the strongest first."""
     heard = candidates.value[level, :, row, column]
-    order = np.argsort(-heard, kind="mergesort")  # of equal links the first device comes first
+    order = np.argsort(-heard, kind="mergesort")  # stable: of equal links the first device
     candidates.device[place], candidates.worth[place] = order, heard[order]
     candidates.listed[place] = True
 
@@ -363,7 +376,7 @@ def _list(candidates: Candidates, level: int, row: int, column: int, place: int)
 @njit(cache=True, nogil=True, error_model="numpy")
 def _walk(mission: Mission, candidates: Candidates, uav: int, tour: np.ndarray, count: int,
           changed: int, course: Course, mask: np.ndarray) -> None:
-    """Fly one UAV's tour (W, 3) from where it sets out to the waypoint that has changed."""
+    """Simulate one UAV's moves from the slot in which it sets out to the waypoint `changed`."""
     level, (rows, columns) = mission.level[uav], mission.steps_home.shape[1:]
     places, batteries, since = course.place[:, uav], course.battery[uav], course.since[uav]
     slot, reached, hovered = since[changed], changed, 0
@@ -390,9 +403,16 @@ def _walk(mission: Mission, candidates: Candidates, uav: int, tour: np.ndarray, 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _collect(mission: Mission, candidates: Candidates, course: Course, start: int,
              holder: np.ndarray, rank: np.ndarray, empty: np.ndarray) -> None:
-    """Serve the UAVs from a slot on, as `assign` does; `left` is of the beginning of that slot.
+    """Simulate assignment and collection from slot `start` on, with the rules of `assign`.
 
-    `holder` (K,) is -1, `rank` and `empty` (U,) are scratch.
+    Args:
+        mission: mission of the UAVs.
+        candidates: devices in reach of each place.
+        course: places of the UAVs; `left` at the beginning of the slot. Changed.
+        start: first slot.
+        holder: (K,) scratch, all -1.
+        rank: (U,) scratch.
+        empty: (U,) scratch.
     """
     left, listed, worth = course.left, candidates.device, candidates.worth
     (slots, uavs), devices = course.place.shape, len(course.left)
@@ -403,7 +423,7 @@ def _collect(mission: Mission, candidates: Candidates, course: Course, start: in
             if at < 0:
                 continue
             if slot == start or at != course.place[slot - 1, first]:
-                empty[first] = 0  # so many devices at the head of the list have no data
+                empty[first] = 0  # number of devices at the head of the list without data
             i = empty[first]
             while i < devices and worth[at, i] > 0 and left[listed[at, i]] <= 0:
                 i += 1
@@ -418,7 +438,7 @@ def _collect(mission: Mission, candidates: Candidates, course: Course, start: in
                         if v < 0:
                             break
                         device[v] = -1
-                        u, at, i = v, place[v], rank[v]  # which looks for another device
+                        u, at, i = v, place[v], rank[v]  # the loser looks for another device
                     if mission.max_rate:
                         break
                 i += 1
@@ -433,7 +453,7 @@ def _collect(mission: Mission, candidates: Candidates, course: Course, start: in
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fly_tours(mission: Mission, candidates: Candidates, tour: np.ndarray, count: np.ndarray,
                course: Course) -> float:
-    """Fly the tours from take-off; return the share collected, and write an empty `course`."""
+    """Simulate the tours from take-off into an empty `course`; return the share collected."""
     mask, (rows, columns) = np.empty(ACTION_COUNT, np.bool_), mission.steps_home.shape[1:]
     for u in range(len(tour)):
         if mission.battery[u] > 0:
@@ -451,10 +471,26 @@ def _anneal(mission: Mission, candidates: Candidates, tour: np.ndarray, count: n
             only: int, hot: float, score: float, best_tour: np.ndarray, best_count: np.ndarray,
             best: float, progress: np.ndarray, course: Course, trial: Course,
             rng: np.random.Generator) -> tuple[float, float]:
-    """Try a change at every step of `progress` (0 to 1) and keep it by the Metropolis rule.
+    """Anneal tours: try a random change at every step, and keep it by the Metropolis rule.
 
-    `only` is the UAV whose tour is changed, -1 for any; `hot` the temperature at the start.
-    `course` is that of the tours, and `trial` a copy; both follow what is kept.
+    Args:
+        mission: mission of the UAVs.
+        candidates: devices in reach of each place.
+        tour: (U, W, 3) present tours; changed.
+        count: (U,) present numbers of waypoints; changed.
+        only: the only UAV whose tour is changed; -1: any.
+        hot: initial temperature [collected share].
+        score: collected share of the present tours.
+        best_tour: (U, W, 3) best tours; changed.
+        best_count: (U,) their numbers of waypoints; changed.
+        best: their collected share.
+        progress: (n,) progress of the annealing at every step, 0 to 1.
+        course: simulated flight of the present tours; changed.
+        trial: a copy of it; changed.
+        rng: generator of the changes.
+
+    Returns:
+        collected share of the present and of the best tours.
     """
     (slots, uavs), cold = course.place.shape, END_TEMPERATURE / len(course.left)
     mask, scratch = np.empty(ACTION_COUNT, np.bool_), np.zeros((2, uavs), np.int64)
@@ -478,7 +514,7 @@ def _anneal(mission: Mission, candidates: Candidates, tour: np.ndarray, count: n
         new = score
         if first < slots:
             trial.left[:] = course.left
-            for slot in range(slots - 1, first - 1, -1):  # back to that slot, bit by bit the same
+            for slot in range(slots - 1, first - 1, -1):  # undo the collection back to that slot
                 for u in range(uavs):
                     k = course.device[slot, u]
                     if k >= 0:

@@ -1,8 +1,8 @@
-"""A small policy that was trained in many worlds, and flies in one that it has never seen at once.
+"""A small pretrained policy that flies missions it was not trained on (`--algorithm policy`).
 
-A UAV sees the devices that have data as tokens, and each move by how it approaches them in the map.
-Devices are pooled by mean, maximum and attention, so there may be any number of them, and all UAVs
-share the weights. It imitates plans, which know the whole flight, slot by slot.
+Each device with data is a token, and each move is described by how it approaches the devices in the
+map. Tokens are pooled by mean, maximum and attention, so any number of devices is possible. All
+UAVs share the weights. The network imitates the planner's plans slot by slot.
 `python -m studies.policy train` trains it.
 """
 
@@ -24,22 +24,22 @@ from marl.planner import expected_data, plan
 from radiotwin.runtime.compiled import List, njit
 
 WEIGHTS = Path(__file__).with_name("policy.safetensors")
-BEST_RATE = 10.0  # [bit/s/Hz], about the best link; rates are in units of it
-PRICES = np.array([3.0, 12.0, 40.0])  # steps of flight that e times the rate is worth
-FAR = 200.0  # steps to a device that is not heard anywhere
-MOVE_COUNT = NO_OP  # a UAV that flies has no no-op
+BEST_RATE = 10.0  # unit of rates, about that of the best link [bit/s/Hz]
+PRICES = np.array([3.0, 12.0, 40.0])  # flight steps that are worth a factor e of the rate
+FAR = 200.0  # steps that count for a device that is not heard anywhere
+MOVE_COUNT = NO_OP  # actions of a flying UAV: all but the no-op
 TOKEN, OWN, MOVE, APPROACH = 26, 10, 2, len(PRICES) + 1  # numbers of features
 
 
 class Outlook(NamedTuple):
-    """What a map says of each cell; P prices.
+    """Features of a map that do not change in flight; P prices.
 
     Attributes:
-        rate: (L, K, ny, nx) float32 expected in a slot.
-        away: (L, K, ny, nx, P) float32 steps to the best place to hear a device from, where a
-            worse rate costs its price in steps: the least sum of both over all places.
-        peak: (L, K, 2) int64 row and column where a device is heard best.
-        heard: (L, K, K) float32 rates of all devices at that place.
+        rate: (L, K, ny, nx) float32 expected rate in a slot [`BEST_RATE`].
+        away: (L, K, ny, nx, P) float32 cost of approaching a device [steps]: the least sum over all
+            cells of the steps there and the price of its lower rate.
+        peak: (L, K, 2) int64 cell (row, column) with the device's highest rate.
+        heard: (L, K, K) float32 rates of all devices in that cell.
     """
 
     rate: np.ndarray
@@ -49,7 +49,7 @@ class Outlook(NamedTuple):
 
     @classmethod
     def of(cls, mission: Mission) -> "Outlook":
-        """Return the outlook in the map of a mission."""
+        """Compute the features of a mission's map."""
         rate = expected_data(mission) / np.float32(BEST_RATE * mission.rate_scale)
         levels, devices, rows, columns = rate.shape
         places = rate.reshape(levels, devices, -1)
@@ -62,14 +62,14 @@ class Outlook(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """Features of N UAVs that fly, and K devices.
+    """Input features of the network for N flying UAVs and K devices.
 
     Attributes:
-        token: (N, K, TOKEN) float32 of each device for the UAV.
-        waiting: (N, K) bool: it has data, and is heard somewhere; the others are not looked at.
-        own: (N, OWN) float32 of the UAV and the team.
-        approach: (N, MOVE_COUNT, K, APPROACH) float32 how much nearer a move comes to each device.
-        move: (N, MOVE_COUNT, MOVE) float32 of each move.
+        token: (N, K, TOKEN) float32 features of each device for the UAV.
+        waiting: (N, K) bool, devices that have data and are heard somewhere; others are masked.
+        own: (N, OWN) float32 features of the UAV and the team.
+        approach: (N, MOVE_COUNT, K, APPROACH) float32 how much a move approaches each device.
+        move: (N, MOVE_COUNT, MOVE) float32 features of each move.
         mask: (N, MOVE_COUNT) bool feasible moves.
     """
 
@@ -82,14 +82,14 @@ class Seen(NamedTuple):
 
     @classmethod
     def blank(cls, count: int, devices: int) -> "Seen":
-        """Return features of zeros."""
+        """Return zero features of `count` UAVs."""
         shapes = ((devices, TOKEN), (devices,), (OWN,), (MOVE_COUNT, devices, APPROACH),
                   (MOVE_COUNT, MOVE), (MOVE_COUNT,))
         return cls(*(np.zeros((count, *shape), np.bool_ if i in (1, 5) else np.float32)
                      for i, shape in enumerate(shapes)))
 
     def first(self, count: int) -> list[Tensor]:
-        """Return a copy of the first rows, and make them zero."""
+        """Return a copy of the first `count` rows as tensors, and reset these rows to zero."""
         rows = [torch.tensor(array[:count]) for array in self]
         for array in self:
             array[:count] = 0
@@ -98,7 +98,7 @@ class Seen(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _spread(rate: np.ndarray, away: np.ndarray) -> None:
-    """Find `Outlook.away`: a distance transform, once down and once up the map."""
+    """Compute `Outlook.away` from rates by a two-pass distance transform."""
     levels, devices, rows, columns = rate.shape
     for level, k in np.ndindex(levels, devices):
         for p in range(len(PRICES)):
@@ -120,7 +120,7 @@ def _spread(rate: np.ndarray, away: np.ndarray) -> None:
 
 @njit(cache=True, nogil=True)
 def _look(mission: Mission, outlook: Outlook, frame: Frame, e: int, seen: Seen, n: int) -> int:
-    """Write what the flying UAVs of a flight see, from row `n` on; return the row after them."""
+    """Write the features of the flying UAVs of flight `e` from row `n` on; return the next row."""
     battery, left = frame.battery[e], frame.data_units[e]
     uavs, devices = len(battery), len(left)
     mask, drain, waiting = np.empty(ACTION_COUNT, np.bool_), np.zeros(devices), left > 0
@@ -133,7 +133,7 @@ def _look(mission: Mission, outlook: Outlook, frame: Frame, e: int, seen: Seen, 
         for k in range(devices):
             best = outlook.heard[level, k, k]
             waiting[k] = left[k] > 0 and best > 0
-            # Slots that its data take from the best place
+            # Slots needed to collect its data from the best cell
             drain[k] = left[k] / (best * BEST_RATE * mission.rate_scale) if waiting[k] else 0.0
         count = waiting.sum()
         own = seen.own[n]
@@ -170,7 +170,7 @@ def _look(mission: Mission, outlook: Outlook, frame: Frame, e: int, seen: Seen, 
 @njit(cache=True, nogil=True)
 def _look_at(mission: Mission, outlook: Outlook, frame: Frame, e: int, u: int, k: int,
              drain: float, mean_left: float, slack: float, token: np.ndarray) -> None:
-    """Write what a UAV sees of a device with data."""
+    """Write the token of device `k` for UAV `u` of flight `e`; `drain` is in slots."""
     level, row, column = mission.level[u], frame.cell[e, u, 0], frame.cell[e, u, 1]
     battery, left, assigned = frame.battery[e], frame.data_units[e], frame.assigned[e]
     away = outlook.away[level, k, row, column]
@@ -211,7 +211,7 @@ def _look_at(mission: Mission, outlook: Outlook, frame: Frame, e: int, u: int, k
 
 @njit(cache=True, nogil=True)
 def _look_around(mission: Mission, outlook: Outlook, frame: Frame, seen: Seen) -> int:
-    """Write what all flying UAVs of all flights see, in their order; return how many there are."""
+    """Write the features of all flying UAVs of all flights of a mission; return their number."""
     n = 0
     for e in range(len(frame.battery)):
         n = _look(mission, outlook, frame, e, seen, n)
@@ -221,7 +221,7 @@ def _look_around(mission: Mission, outlook: Outlook, frame: Frame, seen: Seen) -
 @njit(cache=True, nogil=True)
 def _look_everywhere(missions: "List[Mission]", outlooks: "List[Outlook]", frames: "List[Frame]",
                      seen: Seen) -> int:
-    """Do the same in many worlds."""
+    """Write the features of all flying UAVs of one flight in each world; return their number."""
     n = 0
     for w in range(len(missions)):
         n = _look(missions[w], outlooks[w], frames[w], 0, seen, n)
@@ -229,10 +229,10 @@ def _look_everywhere(missions: "List[Mission]", outlooks: "List[Outlook]", frame
 
 
 class EntityNetwork(nn.Module):
-    """Scores of the moves of N UAVs.
+    """Network that scores the moves of N UAVs.
 
-    Attention weights say how much each device attracts the UAV; a move is scored by how it
-    approaches them, weighted so. Half of the heads also pool what is known of the devices.
+    Attention weights tell how much each device attracts the UAV. A move is scored by how it
+    approaches the devices, weighted by attention. Half of the heads also pool the device features.
     """
 
     def __init__(self, width: int = 48, heads: int = 6) -> None:
@@ -247,12 +247,12 @@ class EntityNetwork(nn.Module):
     def forward(self, token: Tensor, waiting: Tensor, own: Tensor, approach: Tensor, move: Tensor,
                 mask: Tensor) -> Tensor:
         """Return the (N, MOVE_COUNT) scores of the moves; arguments are those of `Seen`."""
-        there = waiting[..., None]
-        device = (self.device(token) + self.own(own)[:, None]).relu() * there
-        mean = device.sum(1) / there.sum(1).clamp(min=1)
+        valid = waiting[..., None]
+        device = (self.device(token) + self.own(own)[:, None]).relu() * valid
+        mean = device.sum(1) / valid.sum(1).clamp(min=1)
         pooled = self.pooled(torch.cat([mean, device.amax(1)], 1))
-        device = (self.again(device) + pooled[:, None]).relu() * there
-        weight = self.attention(device).masked_fill(~there, -1e9).softmax(1).transpose(1, 2)
+        device = (self.again(device) + pooled[:, None]).relu() * valid
+        weight = self.attention(device).masked_fill(~valid, -1e9).softmax(1).transpose(1, 2)
         weight = weight * waiting[:, None]
         pooled = (weight[:, :weight.shape[1] // 2] @ device).flatten(1)
         state = self.state(torch.cat([pooled, mean], 1)).relu()
@@ -262,14 +262,14 @@ class EntityNetwork(nn.Module):
 
 
 class EntityPolicy:
-    """Fly the moves that a network scores best, in the map that is believed."""
+    """Policy that flies the move with the best score, given the map that the UAVs have."""
 
     def __init__(self, network: EntityNetwork, believed: Mission) -> None:
         self._network, self._mission = network, believed
         self._outlook = Outlook.of(believed)
 
     def start(self, mission: Mission, flights: int) -> None:
-        """See `marl.flights.Policy`; of the mission that is flown, nothing is read."""
+        """See `marl.flights.Policy`; the map of the mission that is flown is not read."""
         self._seen = Seen.blank(flights * self._mission.uavs, self._mission.devices)
 
     def act(self, frame: Frame) -> np.ndarray:
@@ -283,23 +283,17 @@ class EntityPolicy:
 
 
 class Pretrained(Learner):
-    """`--algorithm policy`: the network of this package, which was trained in other worlds."""
+    """`--algorithm policy`: fly the pretrained network of this package."""
 
     learns = False
 
     @override
-    def prepare(self, mission: Mission,
-                on_progress: Callable[[int], None]) -> list[dict[str, float]]:
-        self._mission = mission
-        return []
-
-    @override
     def policy(self, rng: np.random.Generator) -> Policy:
-        return EntityPolicy(read_network(WEIGHTS), self._mission)
+        return EntityPolicy(read_network(WEIGHTS), self.mission)
 
 
 def read_network(path: Path) -> EntityNetwork:
-    """Return a network with the weights of a file."""
+    """Load a network from a safetensors file."""
     network = EntityNetwork()
     network.load_state_dict(load_file(path))
     return network
@@ -307,15 +301,15 @@ def read_network(path: Path) -> EntityNetwork:
 
 def demonstrations(missions: list[Mission], iterations: int, rng: np.random.Generator,
                    ) -> list[Tensor]:
-    """Plan in many worlds, and fly the plans.
+    """Plan in many missions, fly the plans, and record features and moves for imitation.
 
     Args:
-        missions: the worlds; they may differ in size.
+        missions: missions, which may differ in size.
         iterations: plans that the planner tries in each.
-        rng: of the plans and of the shadowing.
+        rng: generator for plans and shadowing.
 
     Returns:
-        What the UAVs saw in all slots, as `Seen`, and (N,) the moves that they took.
+        The features of `Seen` of all UAVs in all slots, and (N,) the moves that they took.
     """
     uavs, devices = (max(sizes) for sizes in zip(*((m.uavs, m.devices) for m in missions)))
     slots = max(mission.longest for mission in missions)
@@ -335,14 +329,14 @@ def demonstrations(missions: list[Mission], iterations: int, rng: np.random.Gene
 
 def imitate(shown: list[Tensor], updates: int, seed: int, batch: int = 1024, rate: float = 3e-3,
             on_progress: Callable[[int], None] = lambda _: None) -> EntityNetwork:
-    """Return a network that takes the moves of demonstrations.
+    """Train a network to predict the moves of demonstrations (cross entropy, Adam).
 
     Args:
-        shown: of `demonstrations`.
-        updates: steps of Adam.
-        seed: of the weights at the start, and of the batches.
-        batch: UAVs of a step.
-        rate: of Adam at the start; it falls to a hundredth.
+        shown: result of `demonstrations`.
+        updates: number of updates.
+        seed: random seed of initial weights and batches.
+        batch: UAVs in a batch.
+        rate: initial learning rate; it falls linearly to a hundredth.
         on_progress: called with the number of updates since the last call.
     """
     torch.manual_seed(seed)

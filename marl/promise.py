@@ -1,10 +1,9 @@
-"""A plan with a promise: the share of the data that it will collect, and how sure that is.
+"""Predict the share of data that a plan collects, with quantiles over possible worlds.
 
-Plans are searched on what the twin expects, and on less than that: where all is expected to be
-collected with battery to spare, only a cautious plan uses the rest against what may go wrong. The
-best of them is flown in worlds that the twin holds possible (`marl.worlds`), drawn apart from those
-that chose it. The sizing asks how many UAVs with which battery, and from which base, collect a
-wanted share in a wanted share of the worlds.
+Plans are searched with the expected levels, and with levels lowered by several standard deviations
+(cautious plans, which use spare battery as a reserve). The plan with the best mean in some worlds
+(`marl.worlds`) is evaluated in other, independent worlds. The sizing repeats this for numbers of
+UAVs, batteries and bases.
 """
 
 from collections.abc import Callable, Iterable
@@ -22,19 +21,19 @@ from marl.settings import stream
 from marl.worlds import WorldSource
 
 QUANTILES = (0.1, 0.5, 0.9)
-CAUTION = (0.0, 0.7, 1.4, 2.1)  # standard deviations of the errors, by which plans expect less
-TRIED_PLANS, CHOOSING_WORLDS = len(CAUTION), 20  # the plan flies that collects most in so many
+CAUTION = (0.0, 0.7, 1.4, 2.1)  # levels are lowered by this many standard deviations of errors
+TRIED_PLANS, CHOOSING_WORLDS = len(CAUTION), 20  # number of plans; worlds that choose the best
 SCHEMA = "radiotwin.plan/1"
 
 
 @dataclass(frozen=True, eq=False)
 class Promise:
-    """What a plan collects in worlds that the twin holds possible.
+    """Shares of data that a plan collects in W possible worlds.
 
     Attributes:
-        plan: as it is flown.
-        share: (W,) of the data waiting at devices that transmit, in each world.
-        by_device: (W, K) the same of each device; NaN where it does not transmit.
+        plan: the plan.
+        share: (W,) share of the data of transmitting devices, in each world.
+        by_device: (W, K) share of each device's data; NaN if it does not transmit.
     """
 
     plan: Plan
@@ -43,17 +42,19 @@ class Promise:
 
     @property
     def quantiles(self) -> dict[str, float]:
-        """P10, P50 and P90 of the share: nine, five and one in ten worlds have more."""
+        """P10, P50 and P90 of the share; P10 is exceeded in nine of ten worlds."""
         return _quantiles(self.share)
 
     def chance(self, wanted: float) -> float:
-        """Return the share of the worlds in which at least a wanted share is collected."""
+        """Return the share of worlds in which at least a wanted share is collected."""
         return float((self.share >= wanted).mean())
 
     def record(self, names: Iterable[str], silent: np.ndarray) -> dict[str, Any]:
-        """Return what `plan.json` says of the share, of all data and of each device.
+        """Return the entries of `plan.json` on shares of all data and of each device.
 
-        That of a device which transmits in none of the worlds is None.
+        Args:
+            names: names of the devices.
+            silent: (K,) probability that a device does not transmit.
         """
         devices = [{"device": name, "silent": float(round(s, 3)),
                     "share": _quantiles(each[np.isfinite(each)])
@@ -65,14 +66,14 @@ class Promise:
 
 def promise(prior: Prior, mission: Mission, worlds: int, iterations: int, seed: int,
             on_progress: Callable[[int], None] = lambda _: None) -> Promise:
-    """Search a plan, and fly it in worlds.
+    """Search plans, choose the best, and evaluate it in possible worlds.
 
     Args:
-        prior: what the twin believes.
-        mission: in the twin; its UAVs are those that fly.
-        worlds: to judge the plan.
+        prior: prior of the belief, see `marl.worlds.twin_prior`.
+        mission: mission in the twin's map.
+        worlds: number of worlds that evaluate the plan.
         iterations: plans tried in a search.
-        seed: of plans and worlds.
+        seed: random seed of plans and worlds.
         on_progress: called with the number of searches done since the last call.
     """
     source = WorldSource(prior, mission)
@@ -96,7 +97,7 @@ def promise(prior: Prior, mission: Mission, worlds: int, iterations: int, seed: 
 
 
 def _cautious(prior: Prior, caution: float) -> Prior:
-    """Return a belief in levels that are lower by so many standard deviations of their errors."""
+    """Lower a prior's levels by `caution` standard deviations of their lasting errors."""
     if not caution:
         return prior
     of_device = prior.level_sd_db**2 + prior.common_sd_db**2
@@ -109,7 +110,7 @@ def _cautious(prior: Prior, caution: float) -> Prior:
 
 def _flown(found: Plan, real: Mission, transmits: np.ndarray,
            rng: np.random.Generator) -> tuple[float, np.ndarray]:
-    """Return the share of the data that a plan collects in a world, and of each device (K,)."""
+    """Fly a plan in a world; return the share of all data, and of each device's (K,), collected."""
     flights = evaluate(real, PlanPolicy(found.actions), 1, rng)
     served, taken = flights.frames.assigned[0], np.zeros(real.devices)
     np.add.at(taken, served[served >= 0], flights.collected[0][served >= 0])
@@ -120,20 +121,21 @@ def _flown(found: Plan, real: Mission, transmits: np.ndarray,
 
 
 def _quantiles(share: np.ndarray) -> dict[str, float]:
+    """Return `p10`, `p50` and `p90` of shares (W,)."""
     return {f"p{100 * q:.0f}": float(round(value, 4))
             for q, value in zip(QUANTILES, np.quantile(share, QUANTILES), strict=True)}
 
 
 @dataclass(frozen=True)
 class Size:
-    """One way to equip a mission, and what is promised of it.
+    """One configuration of a mission, and the predicted share of data.
 
     Attributes:
         uavs: number of UAVs.
-        battery: of each, in battery units (a move costs 1).
+        battery: battery of each UAV [moves].
         base: name of the base, or `all`.
-        p10, p50, p90: of the share collected.
-        chance: share of the worlds in which the wanted share is collected.
+        p10, p50, p90: quantiles of the collected share.
+        chance: share of worlds in which the wanted share is collected.
     """
 
     uavs: int
@@ -146,12 +148,12 @@ class Size:
 
 
 def sized(mission: Mission, uavs: Iterable[int], battery: float) -> Mission:
-    """Return a mission with other UAVs: copies of some of its own, with another battery.
+    """Return a mission with copies of some of its UAVs, and another battery.
 
     Args:
-        mission: whose UAVs are copied.
-        uavs: numbers of those that are copied, one for each that flies.
-        battery: of each, in battery units.
+        mission: mission with the UAVs to copy.
+        uavs: number of the UAV to copy, for each UAV of the result.
+        battery: battery of each UAV [moves].
     """
     rows = np.array(list(uavs))
     return mission._replace(
@@ -161,9 +163,9 @@ def sized(mission: Mission, uavs: Iterable[int], battery: float) -> Mission:
 
 
 def bases(mission: Mission, names: list[str]) -> dict[str, list[int]]:
-    """Return the bases of a mission: name of their first UAV -> UAVs that start and end there.
+    """Return the UAVs by base (common start and terminal), named after the base's first UAV.
 
-    Of several bases, `all` uses them in turn.
+    With several bases, `all` has the UAVs of all bases in turn.
     """
     found: dict[tuple, list[int]] = {}
     for u in range(mission.uavs):
@@ -181,10 +183,19 @@ def bases(mission: Mission, names: list[str]) -> dict[str, list[int]]:
 def sizes(prior: Prior, mission: Mission, names: list[str], counts: Iterable[int],
           batteries: Iterable[float], wanted: float, worlds: int, iterations: int, seed: int,
           on_progress: Callable[[int], None] = lambda _: None) -> list[Size]:
-    """Return what is promised for numbers of UAVs, batteries and bases.
+    """Evaluate `promise` for combinations of numbers of UAVs, batteries and bases.
 
-    Batteries that do not reach from a base's start to its end are left out. Other arguments are
-    those of `promise`; `names` are those of the mission's UAVs.
+    Args:
+        prior: prior of the belief.
+        mission: mission in the twin's map.
+        names: names of the mission's UAVs.
+        counts: numbers of UAVs.
+        batteries: batteries [moves]; those that do not reach from start to terminal are left out.
+        wanted: wanted share of the data.
+        worlds: number of worlds.
+        iterations: plans tried in a search.
+        seed: random seed.
+        on_progress: called with the number of searches done since the last call.
     """
     rows, counts, batteries = [], list(counts), list(batteries)
     for base, group in bases(mission, names).items():
@@ -203,6 +214,6 @@ def sizes(prior: Prior, mission: Mission, names: list[str], counts: Iterable[int
 
 
 def smallest(rows: list[Size], confidence: float) -> Size | None:
-    """Return the fewest UAVs, with the least battery, that promise enough; None: no size does."""
+    """Return the size with the fewest UAVs, then the least battery, with a sufficient chance."""
     enough = [row for row in rows if row.chance >= confidence]
     return min(enough, key=lambda row: (row.uavs, row.battery), default=None)

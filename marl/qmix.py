@@ -1,8 +1,7 @@
-"""QMIX: recurrent agents whose values a monotonic mixer combines [1], and IQL without it [2].
+"""QMIX: recurrent agents with a monotonic mixer of their action values [1]; IQL: without it [2].
 
-From top to bottom: the agent, the mixer, the loss and its update, the policy, the trainer of a
-replica, and the learner that trains in one map after the other. Exploration and replay memory are
-in `marl.training`, the agent's recurrent unit in `marl.gru`.
+From top to bottom: agent, mixer, loss and update, policy, trainer of a replica, learner.
+Exploration and replay memory are in `marl.training`, the recurrent layer in `marl.gru`.
 
 [1] Rashid et al., "QMIX: Monotonic value function factorisation for deep multi-agent reinforcement
     learning", ICML 2018.
@@ -19,7 +18,7 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import override
 
-from marl.checkpoint import COUNT, GENERATOR, require, require_plan
+from marl.checkpoint import COUNT, GENERATOR, require
 from marl.environment import (
     ACTION_COUNT,
     Environment,
@@ -33,21 +32,18 @@ from marl.flights import Flights, Policy, evaluate, fly
 from marl.gru import gru
 from marl.learner import Flown, Learner, Setup
 from marl.mission import Mission
-from marl.planner import PlanPolicy, plan
 from marl.replicas import Replicas
 from marl.settings import LearnerSettings, stream
 from marl.training import Batch, Exploration, Replay
 from radiotwin.propagation.laws.adam import Adam
 
-GUIDED_SHARE = 0.25  # of the training flights, with the planner's help
-MAX_GRADIENT_NORM = 10.0
-MIN_GAIN = 0.02  # of the collected share, for a new plan to replace the one before
+MAX_GRADIENT_NORM = 10.0  # gradients are clipped to this
 
 
 class Agent(nn.Module):
-    """Action values of one UAV from what it has seen so far; all UAVs share the weights.
+    """Recurrent network of a UAV's action values from its observations; all UAVs share the weights.
 
-    Each sees its own number as a one-hot vector.
+    The UAV's number enters as a one-hot vector.
     """
 
     def __init__(self, observation_size: int, uavs: int, hidden: int,
@@ -61,18 +57,18 @@ class Agent(nn.Module):
 
     def forward(self, observation: Tensor, last_action: Tensor, sizes: np.ndarray,
                 memory: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Walk through flights, packed as in `Batch`.
+        """Compute the action values in all slots of flights that are packed as in `Batch`.
 
         Args:
-            observation: (N, U, observation_size)
-            last_action: (N, U) int64, of the slot before; -1 in the first one.
-            sizes: (T,) int64 flights in each slot.
-            memory: (sizes[0] * U, hidden) from the slot before the first; None for zero.
+            observation: (N, U, observation_size) observations.
+            last_action: (N, U) int64 action of the slot before; -1 in the first one.
+            sizes: (T,) int64 number of flights in each slot.
+            memory: (sizes[0] * U, hidden) initial hidden state; None: zero.
 
         Returns:
-            (N, U, 6) action values, and the memory after the last slot.
+            (N, U, 6) action values, and the hidden state after the last slot.
         """
-        # The product of a matrix and a one-hot vector is a column of it: an embedding.
+        # Products with one-hot vectors are computed as embeddings.
         weight, size = self.encoder.weight, observation.shape[-1]
         rows = torch.cat([weight[:, size:size + ACTION_COUNT].t(),
                           weight.new_zeros(1, self.hidden)])
@@ -84,7 +80,7 @@ class Agent(nn.Module):
 
 
 class Mixer(nn.Module):
-    """Q_tot of all UAVs from the values of their actions and the state; monotonic in each value."""
+    """Network of Q_tot from the UAVs' action values and the state, monotonic in each value."""
 
     def __init__(self, state_size: int, uavs: int, width: int,
                  generator: torch.Generator) -> None:
@@ -97,8 +93,8 @@ class Mixer(nn.Module):
         _initialise(self, generator)
 
     def forward(self, chosen: Tensor, state: Tensor) -> Tensor:
-        """Return Q_tot (…) of (…, U) values and (…, state_size) states."""
-        # Absolute weights from the hypernetworks keep the mixing monotonic.
+        """Return Q_tot (…) for action values (…, U) and states (…, state_size)."""
+        # Absolute values of the hypernetworks' weights make the mixing monotonic.
         first = self.first_weight(state).abs().unflatten(-1, (self.uavs, self.width))
         mixed = (chosen.unsqueeze(-1) * first).sum(-2) + self.first_bias(state)
         mixed = nn.functional.elu(mixed) * self.last_weight(state).abs()
@@ -107,7 +103,7 @@ class Mixer(nn.Module):
 
 @torch.no_grad()
 def _initialise(module: nn.Module, generator: torch.Generator) -> None:
-    """Draw weights from PyTorch's own distributions, but not from its global generator."""
+    """Draw weights from PyTorch's default distributions with a given generator."""
     for layer in module.modules():
         if isinstance(layer, nn.Linear | nn.GRU):
             width = layer.in_features if isinstance(layer, nn.Linear) else layer.hidden_size
@@ -117,12 +113,12 @@ def _initialise(module: nn.Module, generator: torch.Generator) -> None:
 
 
 class QNetworks:
-    """Agent and mixer, their target copies, and the optimiser.
+    """Agent and mixer with their target networks and optimiser.
 
     Args:
-        settings: of learning.
-        mission: gives the sizes.
-        seed: of the initial weights.
+        settings: settings of learning.
+        mission: mission, for array sizes.
+        seed: random seed of the initial weights.
         device: torch device.
     """
 
@@ -141,13 +137,16 @@ class QNetworks:
         self.optimiser = Adam(self.parameters())
 
     def parameters(self) -> list[Tensor]:
-        """Return the weights that are learned."""
+        """Return the trainable weights."""
         return [weight for module in self.modules.values() for weight in module.parameters()]
 
     def update(self, flights: Flights, mission: Mission, learning_rate: float) -> dict[str, float]:
-        """Make one step of gradient descent on the squared TD errors of some flights.
+        """Make one gradient step on the squared TD errors of recorded flights.
 
-        They may be recorded in an earlier map; features are made by the present mission.
+        Args:
+            flights: flights, perhaps of an earlier map.
+            mission: present mission, by which features are computed.
+            learning_rate: learning rate of the step.
 
         Returns:
             `loss`, `gradient_norm` and `mean_value` (mean of Q_tot).
@@ -159,8 +158,7 @@ class QNetworks:
         with torch.no_grad():
             target_values, _ = self.targets["agent"](batch.observation, batch.last_action,
                                                      batch.sizes)
-            # Double Q-learning: the online network chooses the action, the target network
-            # gives its value.
+            # Double Q-learning: the online network chooses, the target network values the action.
             ranked = (values.detach() if settings.double_q else target_values)
             best = ranked.masked_fill(~batch.mask, -torch.inf).argmax(-1, keepdim=True)
             best = self.mix(target_values.gather(-1, best).squeeze(-1), batch.state, self.targets)
@@ -179,11 +177,11 @@ class QNetworks:
                 "mean_value": float(chosen.detach().mean())}
 
     def reward(self, flights: Flights) -> np.ndarray:
-        """Return the (E, T) float32 rewards that are learned from; a subclass may shape them."""
+        """Return the rewards (E, T) float32 of flights; a subclass may shape them."""
         return flights.collected.sum(axis=2) / np.float32(self.settings.reward_scale)
 
     def mix(self, values: Tensor, state: Tensor, modules: dict[str, nn.Module]) -> Tensor:
-        """Return the values that are learned: (N, 1) Q_tot of (N, U) values of actions."""
+        """Return the values to be learned from action values (N, U): Q_tot (N, 1)."""
         return modules["mixer"](values, state).unsqueeze(-1)
 
     def copy_to_targets(self) -> None:
@@ -192,7 +190,7 @@ class QNetworks:
             self.targets[name].load_state_dict(module.state_dict())
 
     def _batch(self, flights: Flights, mission: Mission) -> Batch:
-        """Return flights as the networks take them."""
+        """Pack flights with the features of the present mission."""
         order = np.argsort(-flights.length, kind="stable")
         slots = np.arange(flights.length.max())
         valid = slots[:, None] < flights.length[order]
@@ -213,9 +211,9 @@ class QNetworks:
                      valid.sum(axis=1))
 
     def weights(self) -> dict[str, np.ndarray]:
-        """Return copies of the weights that are averaged over replicas.
+        """Return copies of the weights that replicas average.
 
-        With `federate_all` also of the target networks and of the optimiser's moments.
+        With `federate_all` they include the target networks and the optimiser's moments.
         """
         return {name: tensor.detach().cpu().numpy().copy() for name, tensor in self._federated()}
 
@@ -226,6 +224,7 @@ class QNetworks:
             parameter.copy_(torch.from_numpy(weights[name]))
 
     def _federated(self) -> list[tuple[str, Tensor]]:
+        """Return the names and tensors that replicas average."""
         modules, moments = dict(self.modules), {}
         if self.settings.federate_all:
             modules |= {f"target_{name}": module for name, module in self.targets.items()}
@@ -236,13 +235,13 @@ class QNetworks:
                 for number, tensor in enumerate(tensors)]
 
     def state(self) -> dict:
-        """Return a checkpoint."""
+        """Return the state for a checkpoint."""
         return {"updates": self.updates, "optimiser": self.optimiser.state_dict(),
                 **{name: module.state_dict() for name, module in self.modules.items()},
                 **{f"target_{name}": module.state_dict() for name, module in self.targets.items()}}
 
     def load_state(self, state: dict) -> None:
-        """Go on from a checkpoint."""
+        """Restore networks and optimiser from a checkpoint's state."""
         like = self.state()
         require(state, like | {"updates": COUNT, "optimiser": like["optimiser"] | {"count": COUNT}})
         self.updates = state["updates"]
@@ -254,17 +253,17 @@ class QNetworks:
 
 def td_lambda_targets(reward: Tensor, best: Tensor, valid: Tensor, discount: float,
                       td_lambda: float) -> Tensor:
-    """Return TD(λ) returns: G_t = r_t + γ ((1 - λ) V_{t+1} + λ G_{t+1}), backwards.
+    """Compute TD(λ) targets: G_t = r_t + γ ((1 - λ) V_{t+1} + λ G_{t+1}), backwards in time.
 
     Args:
-        reward: (T, E, 1)
+        reward: (T, E, 1) reward in each slot.
         best: (T, E, 1) or (T, E, U) value of the best action in each slot.
-        valid: (T, E, 1), 0 behind the end of a flight, where nothing is worth anything.
+        valid: (T, E, 1) 1 in flight, 0 after its end, where values count as 0.
         discount: γ.
         td_lambda: λ.
 
     Returns:
-        Targets in the shape of `best`.
+        targets in the shape of `best`.
     """
     ahead = torch.cat([valid[1:], torch.zeros_like(valid[:1])])
     following = torch.cat([best[1:], torch.zeros_like(best[:1])])
@@ -277,28 +276,24 @@ def td_lambda_targets(reward: Tensor, best: Tensor, valid: Tensor, discount: flo
 
 
 class AgentPolicy:
-    """Fly the feasible action of greatest value.
+    """Policy that flies the feasible action with the largest value.
 
     Args:
-        agent: see `Agent`; its weights are read at every slot.
+        agent: see `Agent`; its present weights are used in every slot.
         device: torch device of the agent.
-        exploration: replaces some actions; None: none.
-        guide: (T, U) actions of a plan, and the (E,) slots for which each flight follows it before
-            the agents take over.
+        exploration: exploration that replaces some actions; None: none.
     """
 
     def __init__(self, agent: torch.nn.Module, device: str = "cpu",
-                 exploration: Exploration | None = None,
-                 guide: tuple[np.ndarray, np.ndarray] | None = None) -> None:
-        self._agent, self._device = agent, device
-        self._exploration, self._guide = exploration, guide
+                 exploration: Exploration | None = None) -> None:
+        self._agent, self._device, self._exploration = agent, device, exploration
 
     def start(self, mission: Mission, flights: int) -> None:
         """See `marl.flights.Policy`."""
         self._mission = mission
         self._memory = None
         self._last = np.full((flights, mission.uavs), -1, dtype=np.int64)
-        self._sizes, self._slot = np.array([flights]), 0
+        self._sizes = np.array([flights])
         if self._exploration is not None:
             self._exploration.start(flights, mission.uavs)
 
@@ -312,26 +307,20 @@ class AgentPolicy:
         action = np.where(mask, values.cpu().numpy(), -np.inf).argmax(axis=-1)
         if self._exploration is not None:
             action = self._exploration.change(action, mask)
-        if self._guide is not None:
-            plan, slots = self._guide
-            wanted = plan[self._slot]
-            # A UAV that has failed cannot follow.
-            feasible = mask[:, np.arange(len(wanted)), wanted]
-            action = np.where((slots > self._slot)[:, None] & feasible, wanted, action)
-        self._last, self._slot = action, self._slot + 1
+        self._last = action
         return action
 
 
 class Trainer:
-    """One replica: learns a policy by flying in a mission.
+    """One replica, which trains networks on flights in a mission.
 
     Args:
-        make_networks: (settings, mission, seed, device) -> networks.
-        settings: of learning.
-        mission: the rules and the map.
+        make_networks: constructor of networks: (settings, mission, seed, device).
+        settings: settings of learning.
+        mission: mission with the map to train in.
         horizon: episodes over which the learning rate falls.
-        seed: of the initial weights; replicas that are averaged share it.
-        number: of the replica; gives it random numbers of its own.
+        seed: random seed of the initial weights, common to all replicas.
+        number: number of the replica, for its own random numbers.
         device: torch device.
     """
 
@@ -342,16 +331,15 @@ class Trainer:
         self.networks: QNetworks = make_networks(settings, mission, seed, device)
         self.replay = Replay(settings.replay, mission)
         self.episodes, self.slots = 0, 0
-        self._plan: np.ndarray | None = None
         self._rng = stream(seed, "learning", number)
 
-    def enter(self, mission: Mission, plan: np.ndarray | None = None) -> None:
-        """Go on in another map of the mission, maybe with a plan (T, U) in it to learn from."""
-        self.mission, self._plan = mission, plan
+    def enter(self, mission: Mission) -> None:
+        """Continue training in another map of the mission."""
+        self.mission = mission
 
     @property
     def epsilon(self) -> float:
-        """Present share of explored slots."""
+        """Present share of slots in which UAVs explore."""
         settings = self.settings
         done = min(self.slots / settings.epsilon_slots, 1.0) if settings.epsilon_slots else 1.0
         return settings.first_epsilon + done * (settings.last_epsilon - settings.first_epsilon)
@@ -363,11 +351,11 @@ class Trainer:
         return first + min(self.episodes / self.horizon, 1.0) * (last - first)
 
     def train(self, episodes: int) -> dict[str, float]:
-        """Fly some flights and learn from them.
+        """Fly `episodes` flights with exploration, and update the networks.
 
         Returns:
-            Means over them: `train_ratio` of collected data, and the entries of
-            `QNetworks.update`; at their end: `epsilon`, `learning_rate`.
+            means of `train_ratio` (collected share) and of the entries of `QNetworks.update`;
+            `epsilon` and `learning_rate` at the end.
         """
         settings, ratios, losses = self.settings, [], []
         for start in range(0, episodes, settings.parallel):
@@ -387,44 +375,30 @@ class Trainer:
                 "learning_rate": self.learning_rate, **means}
 
     def _fly(self, count: int) -> Flights:
-        guide = None if self._plan is None else (self._plan, self._followed_slots(count))
+        """Fly some flights with exploration."""
         exploration = Exploration(self.epsilon, self.settings.excursion_slots, self._rng)
-        policy = AgentPolicy(self.networks.agent, self.networks.device, exploration, guide)
+        policy = AgentPolicy(self.networks.agent, self.networks.device, exploration)
         return fly(self._environment(count), policy)
 
     def _environment(self, count: int) -> Environment:
         return Environment(self.mission, count, self._rng)
 
-    def _followed_slots(self, count: int) -> np.ndarray:
-        """Draw the slots for which each flight follows the plan.
-
-        A quarter of the flights follow it to the end, the others a random part of it, which
-        becomes shorter as training goes on.
-        """
-        assert self._plan is not None
-        longest = len(self._plan) * (1 - min(self.episodes / self.horizon, 1.0))
-        slots = self._rng.integers(0, int(longest) + 1, count)
-        before, after = (int(np.ceil(GUIDED_SHARE * number)) for number in
-                         (self.episodes, self.episodes + count))
-        slots[:after - before] = len(self._plan)
-        return slots
-
     def weights(self) -> dict[str, np.ndarray]:
-        """Return copies of the weights that are averaged over replicas."""
+        """Return copies of the weights that replicas average."""
         return self.networks.weights()
 
     def set_weights(self, weights: dict[str, np.ndarray]) -> None:
-        """Go on from averaged weights."""
+        """Continue training from averaged weights."""
         self.networks.set_weights(weights)
 
     def state(self) -> dict:
-        """Return a checkpoint."""
+        """Return the state for a checkpoint."""
         return {"episodes": self.episodes, "slots": self.slots,
                 "rng": self._rng.bit_generator.state, "learner": self.networks.state(),
                 "replay": self.replay.state()}
 
     def load_state(self, state: dict) -> None:
-        """Go on from a checkpoint."""
+        """Restore the replica from a checkpoint's state."""
         require(state, {"episodes": COUNT, "slots": COUNT, "rng": GENERATOR, "learner": ...,
                         "replay": ...})
         self.episodes, self.slots = state["episodes"], state["slots"]
@@ -434,14 +408,14 @@ class Trainer:
 
 
 class QMIX(Learner):
-    """`--algorithm qmix`: train one replica in each map.
+    """`--algorithm qmix`: train one replica of QMIX in one map after the other.
 
-    After every block of `federate_every` episodes the current policy is evaluated in the map that
-    it is trained in; the best one there, earlier rounds included, is the one that flies.
+    After every block of `federate_every` episodes the present policy is evaluated in the map it is
+    trained in. The best policy so far, earlier rounds included, is the learner's policy.
 
     Attributes:
-        mission: of the present map.
-        episodes: of training so far.
+        mission: mission in the present map.
+        episodes: training episodes so far.
     """
 
     networks: Callable[..., QNetworks] = QNetworks
@@ -453,7 +427,6 @@ class QMIX(Learner):
         self._current = self.networks(settings, mission, run.seed, setup.device).agent
         self._best = copy.deepcopy(self._current)
         self.episodes, self._highest, self.mission = 0, -np.inf, mission
-        self._actions: np.ndarray | None = None  # of the guide's plan
         horizon = setup.rounds * run.episodes
         self._trainers = Replicas(Trainer, [(self.networks, settings, mission, horizon, run.seed,
                                              number, setup.device) for number in numbers])
@@ -473,24 +446,22 @@ class QMIX(Learner):
         return records
 
     def enter(self, mission: Mission) -> None:
-        """Go on in another map."""
+        """Continue training in another map, in which the best policy so far is evaluated anew."""
         self.mission = mission
-        if self.setup.run.guide == "planner":
-            self._actions = self._better_plan(mission)
-        self._trainers.call("enter", mission, self._actions)
+        self._trainers.call("enter", mission)
         self._highest = self._ratio(mission, self._best) if self.episodes else -np.inf
 
     def judge(self, weights: dict[str, np.ndarray]) -> float:
-        """Return the share that these weights collect in the map; keep the best ones."""
+        """Return the share that a policy with these weights collects in the map; keep the best."""
         _load(self._current, weights)
         ratio = self._ratio(self.mission, self._current)
-        if not ratio <= self._highest:  # also where it is NaN, so that the last one flies
+        if not ratio <= self._highest:  # also if it is NaN, so that the last policy is kept
             self._highest = ratio
             _load(self._best, weights)
         return ratio
 
     def _train(self, episodes: int) -> tuple[dict[str, float], dict[str, np.ndarray]]:
-        """Train for some episodes; return the record to be logged, and the new weights."""
+        """Train all replicas; return the mean of their records, and the merged weights."""
         records, each = self._trainers.call("train", episodes), self._trainers.call("weights")
         for record in records:
             self.training.flights += episodes
@@ -499,14 +470,11 @@ class QMIX(Learner):
                 for name in records[0]}, self._merged(each)
 
     def _merged(self, weights: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-        """Return the weights that the replicas go on with."""
+        """Return the weights with which the replicas continue, given those of each."""
         return weights[0]
 
     def _ratio(self, mission: Mission, agent: Agent) -> float:
-        """Return the share that a policy collects, always in the same shadowing.
-
-        NaN without `selection_flights`.
-        """
+        """Return the mean share that an agent collects, with the same shadowing for all agents."""
         flights, seed = self.setup.settings.selection_flights, self.setup.run.seed
         if not flights:
             return np.nan
@@ -515,45 +483,27 @@ class QMIX(Learner):
         self.selection.add(ratio)
         return float(ratio.mean())
 
-    def _better_plan(self, mission: Mission) -> np.ndarray:
-        """Plan anew, but keep the plan before unless the new one is clearly better.
-
-        A teacher that changes its mind every round teaches little.
-        """
-        run = self.setup.run
-        new = plan(mission, run.planner_iterations, run.seed).actions
-        if self._actions is None:
-            return new
-        before, after = (
-            evaluate(mission, PlanPolicy(actions), run.flights, stream(run.seed, "choice"))
-            .ratio(mission) for actions in (self._actions, new))
-        self.selection.add(before)
-        self.selection.add(after)
-        return new if after.mean() > before.mean() + MIN_GAIN else self._actions
-
     @override
     def policy(self, rng: np.random.Generator) -> Policy:
         return AgentPolicy(self._best, self.setup.device)
 
     @override
     def state(self, last: bool) -> dict:
-        # The replicas' memories are most of a checkpoint.
+        # The replicas' replay memories are most of a checkpoint.
         return {"episodes": self.episodes, "best": self._best.state_dict(),
-                "actions": self._actions, "highest": float(self._highest),
+                "highest": float(self._highest),
                 "training": vars(self.training), "selection": vars(self.selection),
                 "replicas": None if last else self._trainers.call("state")}
 
     @override
     def load_state(self, state: dict) -> None:
         replicas = state["replicas"]
-        require(state, {"episodes": COUNT, "best": self._best.state_dict(), "actions": ...,
+        require(state, {"episodes": COUNT, "best": self._best.state_dict(),
                         "training": ..., "selection": ..., "highest": ...,
                         "replicas": None if replicas is None else [...] * self.replicas})
         self.episodes, self._highest = state["episodes"], float(state["highest"])
         self.training, self.selection = Flown.of(state["training"]), Flown.of(state["selection"])
         self._best.load_state_dict(state["best"])
-        if state["actions"] is not None:
-            self._actions = require_plan(state["actions"], self.setup.mission)
         if replicas is not None:
             self._trainers.call("load_state", each=replicas)
 
@@ -564,12 +514,13 @@ class QMIX(Learner):
 
 @torch.no_grad()
 def _load(agent: nn.Module, weights: dict[str, np.ndarray]) -> None:
+    """Copy the agent's part of averaged weights into an agent."""
     for name, parameter in agent.named_parameters():
         parameter.copy_(torch.from_numpy(weights[f"agent.{name}"]))
 
 
 class IndependentNetworks(QNetworks):
-    """Agent and target agent: one TD error for each UAV."""
+    """Networks without a mixer: one TD error for each UAV."""
 
     mixes = False
 
@@ -579,6 +530,6 @@ class IndependentNetworks(QNetworks):
 
 
 class IQL(QMIX):
-    """`--algorithm iql`: as `QMIX`, without a mixer."""
+    """`--algorithm iql`: independent Q-learning, `QMIX` without a mixer."""
 
     networks = IndependentNetworks

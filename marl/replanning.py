@@ -1,14 +1,13 @@
-"""Planning again in flight, on a belief that what is heard, and what is not, changes.
+"""Replanning in flight (`--algorithm belief`), with a belief updated by received SNRs.
 
-Every few slots a short search changes the rest of the tours, over the data that each slot is
-expected to bring. The map may stay as it was before take-off, or be that of a `marl.belief`. Data
-left at a device are known while its SNR reaches the threshold; before, they are those of the prior.
-With a link the UAVs share all that they hear, and one search changes all tours. Without, each has a
-belief of its own and believes that the others fly the plan made before take-off, until it meets
-one: in reach of each other they exchange what they have heard, and where they mean to fly.
+Every few slots a short annealing changes the remaining tours. The map is fixed, or it is that of a
+`marl.belief`. The data left at a device are known after its SNR reached the threshold; before, the
+prior's are assumed. With a link the UAVs share all readings, and one search changes all tours.
+Without a link each UAV has its own belief and assumes that the others fly the first plan. When two
+UAVs are in reach of each other, they exchange readings and planned tours.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 
 import numpy as np
 from typing_extensions import override
@@ -22,32 +21,32 @@ from marl.planner import Plan, expected_data, fly_on, improve, next_action, plan
 from marl.settings import stream
 from radiotwin.runtime.compiled import njit
 
-LOW_TEMPERATURE = 0.005  # keeps the present plan unless another one is better
-EVERY, ITERATIONS = 2, 6000  # slots between searches, and plans that each tries
+LOW_TEMPERATURE = 0.005  # low, so that hardly any worse plan is accepted [collected share]
+EVERY, ITERATIONS = 2, 6000  # slots between searches; plans tried in each
 
 
 class ReplanPolicy:
-    """Fly a plan that is improved every few slots.
+    """Policy that flies a plan and improves it every few slots.
 
     Args:
-        believed: the mission in the map that the UAVs have; its data are those of the prior.
-        prior: of the belief; None: the map is taken as it is, and nothing is learnt of it.
-        linked: whether the UAVs communicate wherever they are; otherwise where they are in reach.
+        believed: the mission with the map and data that the UAVs assume.
+        prior: prior of the belief; None: the map is fixed.
+        linked: whether the UAVs always communicate; otherwise only in reach of each other.
         every: slots between searches.
-        iterations: plans that a search tries.
-        first_iterations: plans that the search before take-off tries.
-        seed: of the first plan.
-        rng: of the searches in flight.
+        iterations: plans tried in a search.
+        first_iterations: plans tried before take-off.
+        seed: random seed of the first plan.
+        rng: generator of the searches in flight.
     """
 
     def __init__(self, believed: Mission, prior: Prior | None, linked: bool, every: int,
                  iterations: int, first_iterations: int, seed: int,
                  rng: np.random.Generator) -> None:
         self._mission, self._prior, self._linked = believed, prior, linked
-        # A search of one tour needs less than one of all of them.
+        # Searching one tour needs fewer tries than searching all.
         self._iterations = iterations if linked else iterations // 2
         self._every, self._rng = every, rng
-        # Each UAV has a map of its own, by what it has heard.
+        # One level of the map for each UAV, as beliefs differ between UAVs.
         self._planned = believed._replace(level=np.arange(believed.uavs))
         if prior is None:
             self._value = expected_data(believed)[believed.level]
@@ -59,7 +58,7 @@ class ReplanPolicy:
                                           self._first.visits)
 
     def start(self, mission: Mission, flights: int) -> None:
-        """See `marl.flights.Policy`; of the mission that is flown, nothing is read."""
+        """See `marl.flights.Policy`; the map of the mission that is flown is not read."""
         self._slot = 0
         minds = 1 if self._linked else self._mission.uavs
         self._flights = [[_Mind(self, range(self._mission.uavs) if self._linked else [u])
@@ -85,7 +84,7 @@ class ReplanPolicy:
         return action
 
     def _meet(self, frame: Frame, flight: int) -> None:
-        """Exchange what UAVs know that are in reach of each other."""
+        """Exchange readings and planned tours between UAVs whose link exceeds the threshold."""
         mission, minds = self._mission, self._flights[flight]
         cell = frame.cell[flight].astype(float) * mission.step_m
         for u, mind in enumerate(minds):
@@ -100,18 +99,21 @@ class ReplanPolicy:
                     for one, other in ((mind, v), (minds[v], u)):
                         one.others[other] = (
                             self._slot, frame.cell[flight, other].astype(np.int64),
-                            int(frame.battery[flight, other]), self._rest(flight, other))
+                            int(frame.battery[flight, other]),
+                            self._remaining_tour(flight, other))
 
-    def _rest(self, flight: int, u: int) -> tuple[np.ndarray, int]:
-        return _rest(self._tour[flight, u], self._count[flight, u], self._reached[flight, u],
-                     self._hovered[flight, u])
+    def _remaining_tour(self, flight: int, u: int) -> tuple[np.ndarray, int]:
+        """Return the remaining tour of UAV `u` in a flight, and its number of waypoints."""
+        return _remaining(self._tour[flight, u], self._count[flight, u], self._reached[flight, u],
+                          self._hovered[flight, u])
 
     def _search(self, frame: Frame, flight: int) -> None:
+        """Improve the remaining tours of a flight: all at once with a link, else one by one."""
         cell, battery = (array[flight].astype(np.int64) for array in (frame.cell, frame.battery))
-        tours = [self._rest(flight, u) for u in range(self._mission.uavs)]
+        tours = [self._remaining_tour(flight, u) for u in range(self._mission.uavs)]
         for u, mind in enumerate(self._flights[flight]):
             if self._linked:
-                # The data of a device that no UAV hears does not change.
+                # A device that no UAV hears is not served, so its data stay as seen last.
                 found = self._improved(mind, cell, battery, mind.seen, tours, -1)
                 self._take(flight, range(len(tours)), found)
             elif battery[u]:
@@ -122,13 +124,13 @@ class ReplanPolicy:
 
     def _believed_of_others(self, mind: "_Mind",
                             ) -> tuple[np.ndarray, np.ndarray, list[tuple[np.ndarray, int]]]:
-        """Return cells, batteries and rest of the tours of all UAVs, as one believes them."""
+        """Return cells, batteries and remaining tours of all UAVs, as one UAV assumes them."""
         cells, batteries, _, *passed = (array[self._slot] for array in self._expected)
         cells, batteries = cells.copy(), batteries.copy()
-        tours = [_rest(self._first.tour[v], self._first.visits[v], passed[0][v], passed[1][v])
+        tours = [_remaining(self._first.tour[v], self._first.visits[v], passed[0][v], passed[1][v])
                  for v in range(self._mission.uavs)]
         for v, (slot, cell, battery, tour) in mind.others.items():
-            # Flown on since they met.
+            # Simulate that UAV from the slot in which they met until now.
             start = self._planned._replace(start=cell[None], battery=np.array([battery]),
                                            level=np.zeros(1, dtype=np.int64),
                                            steps_home=self._mission.steps_home[v:v + 1])
@@ -136,13 +138,13 @@ class ReplanPolicy:
                                       np.array([tour[1]]))
             now = min(self._slot - slot, len(course[0]) - 1)
             cells[v], batteries[v] = course[0][now, 0], course[1][now, 0]
-            tours[v] = _rest(*tour, int(course[3][now, 0]), int(course[4][now, 0]))
+            tours[v] = _remaining(*tour, int(course[3][now, 0]), int(course[4][now, 0]))
         return cells, batteries, tours
 
     def _left(self, mind: "_Mind") -> np.ndarray:
-        """Return the (K,) data that a UAV without link believes left.
+        """Return the data (K,) that a UAV without a link assumes to be left.
 
-        The data that it saw, less the share that the first plan has taken since.
+        It is the amount seen last, reduced by the share that the first plan collects since then.
         """
         planned, devices = self._expected[2], np.arange(self._mission.devices)
         before = planned[mind.seen_in, devices]
@@ -151,6 +153,7 @@ class ReplanPolicy:
 
     def _improved(self, mind: "_Mind", cell: np.ndarray, battery: np.ndarray, left: np.ndarray,
                   tours: list[tuple[np.ndarray, int]], only: int) -> Plan | None:
+        """Improve tours by the belief of a UAV (or of all); None if no data are left."""
         data_units, value = np.maximum(left, 0.0).astype(float), self._value
         if mind.belief is not None:
             data_units, value = weighted(mind.belief, data_units)
@@ -162,6 +165,7 @@ class ReplanPolicy:
                        only=only, temperature=LOW_TEMPERATURE)
 
     def _take(self, flight: int, uavs: Iterable[int], found: Plan | None) -> None:
+        """Replace the tours of some UAVs in a flight by those of a plan."""
         if found is not None:
             for u in uavs:
                 self._tour[flight, u], self._count[flight, u] = found.tour[u], found.visits[u]
@@ -169,13 +173,13 @@ class ReplanPolicy:
 
 
 class _Mind:
-    """What one UAV knows in a flight, or UAVs with a link.
+    """Knowledge of one UAV in a flight, or of all UAVs with a link.
 
     Attributes:
-        belief: of the map; None where it is taken as it is.
-        seen: (K,) data left when they were seen last; before, as thought before take-off.
-        seen_in: (K,) slot of that; 0: never.
-        others: UAV -> slot, cell, battery and rest of its tour when it was met last.
+        belief: belief of the map; None: the map is fixed.
+        seen: (K,) data left at each device when seen last; at first, those of the mission.
+        seen_in: (K,) slot in which they were seen; 0: never.
+        others: slot, cell, battery and remaining tour of each UAV when it was met last.
     """
 
     def __init__(self, policy: ReplanPolicy, uavs: Iterable[int]) -> None:
@@ -190,7 +194,7 @@ class _Mind:
             u: [] for u in range(mission.uavs)}
 
     def look(self, frame: Frame, flight: int, slot: int) -> None:
-        """Learn from what its UAVs hear in a slot."""
+        """Update the belief and the data left by the SNRs that its UAVs receive in a slot."""
         for u in self._uavs:
             if not frame.battery[flight, u]:
                 continue
@@ -201,7 +205,7 @@ class _Mind:
             self._hear(u, slot, frame.cell[flight, u].astype(np.int64), snr_db.copy())
 
     def learn_from(self, other: "_Mind") -> None:
-        """Take over what another one has heard, and seen later."""
+        """Take over another UAV's readings, and the data left that it has seen later."""
         later = other.seen_in > self.seen_in
         self.seen = np.where(later, other.seen, self.seen)
         self.seen_in = np.where(later, other.seen_in, self.seen_in)
@@ -216,13 +220,12 @@ class _Mind:
 
 
 class BeliefPlanner(Learner):
-    """`--algorithm belief`: plan, and plan again in flight on what is heard."""
+    """`--algorithm belief`: plan, and replan in flight by the received SNRs."""
 
     learns, believes = False, True
 
     def __init__(self, setup: Setup) -> None:
         super().__init__(setup)
-        self._mission = setup.mission
         self._prior: Prior | None = None
 
     @override
@@ -230,31 +233,29 @@ class BeliefPlanner(Learner):
         self._prior = prior
 
     @override
-    def prepare(self, mission: Mission,
-                on_progress: Callable[[int], None]) -> list[dict[str, float]]:
-        self._mission = mission
-        return []
-
-    @override
     def policy(self, rng: np.random.Generator) -> Policy:
         run = self.setup.run
-        prior = Prior.of_mission(self._mission) if self._prior is None else self._prior
-        return ReplanPolicy(self._mission, prior, True, EVERY, ITERATIONS, run.planner_iterations,
+        prior = Prior.of_mission(self.mission) if self._prior is None else self._prior
+        return ReplanPolicy(self.mission, prior, True, EVERY, ITERATIONS, run.planner_iterations,
                             run.seed, stream(run.seed, "planning", 1))
 
 
 def weighted(belief: Belief, data_units: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return data (K,) and data expected of a slot (U, K, ny, nx) as a plan is to count them.
+    """Weight data by the probability that each device transmits, for planning.
 
-    Both by the probability that the device transmits: it takes as long as if it did, and is worth
-    so much.
+    Args:
+        belief: belief of the map and of silent devices.
+        data_units: (K,) data left at each device.
+
+    Returns:
+        (K,) expected data, and (U, K, ny, nx) expected data of a slot on each link.
     """
     transmits = 1.0 - belief.silent
     return data_units * transmits, belief.expected_data() * transmits[None, :, None, None]
 
 
-def _rest(tour: np.ndarray, count: int, reached: int, hovered: int) -> tuple[np.ndarray, int]:
-    """Return the rest of a UAV's tour, and its number of waypoints."""
+def _remaining(tour: np.ndarray, count: int, reached: int, hovered: int) -> tuple[np.ndarray, int]:
+    """Return the remaining tour (W, 3) of a UAV, and its number of waypoints."""
     rest = np.zeros_like(tour)
     rest[:len(tour) - reached] = tour[reached:]
     if reached < count:
@@ -265,7 +266,7 @@ def _rest(tour: np.ndarray, count: int, reached: int, hovered: int) -> tuple[np.
 @njit(cache=True, nogil=True, error_model="numpy")
 def _follow(mission: Mission, frame: Frame, tour: np.ndarray, count: np.ndarray,
             reached: np.ndarray, hovered: np.ndarray) -> np.ndarray:
-    """Return the (E, U) next action of every tour, and update `reached` and `hovered`."""
+    """Return the next actions (E, U) along the tours, and update `reached` and `hovered` (E, U)."""
     flights, uavs = frame.battery.shape
     action = np.empty((flights, uavs), np.int64)
     mask = np.empty(ACTION_COUNT, np.bool_)
@@ -281,10 +282,11 @@ def _follow(mission: Mission, frame: Frame, tour: np.ndarray, count: np.ndarray,
 @njit(cache=True, nogil=True, error_model="numpy")
 def _expected_flight(mission: Mission, value: np.ndarray, tour: np.ndarray, count: np.ndarray,
                      ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the expected course of a plan, at the beginning of every slot.
+    """Simulate a plan with the expected data.
 
-    Cells (T, U, 2), batteries (T, U), data left (T, K), waypoints passed and hovers flown at the
-    next one (T, U).
+    Returns:
+        state at the beginning of every slot: cells (T, U, 2), batteries (T, U), data left (T, K),
+        waypoints passed (T, U), hovers done at the next waypoint (T, U).
     """
     slots, uavs, devices = mission.battery.max() + 1, len(tour), value.shape[1]
     cells = np.empty((slots, uavs, 2), np.int64)

@@ -1,7 +1,4 @@
-"""Replicas of a trainer that train side by side, each in a process of its own.
-
-With them: the threads and the memory of a process that trains, checked before any is taken.
-"""
+"""Run replicas of a trainer in parallel processes; limit threads and memory of training."""
 
 import ctypes
 import math
@@ -23,23 +20,20 @@ from radiotwin.io.signals import deferred
 from radiotwin.runtime.execution import start_process
 from radiotwin.runtime.processes import usable_cores
 
-_COPIES = 4  # of the weights: target network, and two moments of the optimiser
+_COPIES = 4  # copies of the weights: network, target network, two moments of the optimiser
 
 
 def limit_threads(count: int) -> None:
-    """Let PyTorch and every BLAS use `count` threads in this process from now on.
+    """Limit PyTorch and BLAS to `count` threads in this process; 1 is fastest for small matrices.
 
-    On matrices as small as here, one is fastest.
+    It lasts until the process ends.
     """
     torch.set_num_threads(count)
     threadpoolctl.threadpool_limits(count)
 
 
 def keep_memory() -> None:
-    """Let the C library keep freed memory for the next update, which saves an eighth of the time.
-
-    Only the GNU library needs this.
-    """
+    """Let the GNU C library keep freed memory for the next update, which saves 1/8 of the time."""
     if sys.platform == "linux" and hasattr(ctypes.CDLL(None), "mallopt"):
         mmap_threshold, trim_threshold = -3, -1  # M_MMAP_THRESHOLD, M_TRIM_THRESHOLD of malloc.h
         ctypes.CDLL(None).mallopt(mmap_threshold, 32 << 20)
@@ -47,14 +41,14 @@ def keep_memory() -> None:
 
 
 def check_sizes(run: RunSettings, settings: LearnerSettings, mission: Mission) -> None:
-    """Refuse settings that take more memory than `TRAINING_BYTES`; the mission gives the sizes.
+    """Refuse settings that need more memory than `TRAINING_BYTES` for a mission of this size.
 
     Raises:
         BadInput: names the option.
     """
     uavs, devices, slots = mission.uavs, mission.devices, mission.longest
     flight = slots * (4 * (uavs * devices + devices + uavs) + 9 * uavs)  # see Frame and Flights
-    field = 4 * math.prod(mission.snr_db.shape[1:])  # shadowing that stays for a flight
+    field = 4 * math.prod(mission.snr_db.shape[1:])  # shadowing that lasts for a flight
     subject = f"{slots} slots, {uavs} UAVs and {devices} devices"
     needed = {"flights": run.flights * (flight + field)}
     if learner_class(run.algorithm).learns:
@@ -75,72 +69,73 @@ def check_sizes(run: RunSettings, settings: LearnerSettings, mission: Mission) -
 
 
 class Replicas:
-    """Trainers side by side; to be closed.
+    """Trainers in parallel processes; `close` ends them.
 
-    Processes, because three of them use two cores a quarter better than three threads do. With a
-    single replica or core they train one after the other in this process, to the same result.
+    Three processes use two cores 25 % better than three threads. With a single replica or core they
+    train one after the other in this process, with the same result.
 
     Args:
         made: class of the trainers, such as `marl.qmix.Trainer`.
-        arguments: of each of them.
+        arguments: arguments of each trainer.
     """
 
     def __init__(self, made: Callable[..., Any], arguments: Sequence[tuple]) -> None:
-        self._here: list[Any] = []
+        self._local: list[Any] = []
         self._pools: list[Any] = []
         self._begun: list[Future[None]] = []
         if len(arguments) == 1 or usable_cores() == 1:
-            self._here = [made(*each) for each in arguments]
+            self._local = [made(*each) for each in arguments]
             return
         try:
             for each in arguments:
                 pool, _ = start_process({})
                 self._pools.append(pool)
                 self._begun.append(pool.submit(_begin, made, each))
-        except BaseException:  # interrupted, too
+        except BaseException:  # also if interrupted
             self.close()
             raise
 
     def call(self, method: str, *arguments: Any, each: list | None = None) -> list:
-        """Call a method of all trainers at once.
+        """Call a method of all trainers in parallel.
 
         Args:
             method: name of a method of a trainer.
-            arguments: the same for all.
-            each: one more argument for every replica, after the others.
+            arguments: common arguments.
+            each: one further argument for each replica.
 
         Returns:
-            The result of every replica.
+            the result of each replica.
 
         Raises:
             RunFailed: a process has ended.
         """
-        own = [()] * len(self._here or self._pools) if each is None else [(one,) for one in each]
-        if self._here:
-            return [getattr(trainer, method)(*arguments, *mine)
-                    for trainer, mine in zip(self._here, own)]
+        count = len(self._local or self._pools)
+        further = [()] * count if each is None else [(one,) for one in each]
+        if self._local:
+            return [getattr(trainer, method)(*arguments, *one)
+                    for trainer, one in zip(self._local, further)]
         for begun in self._begun:
             result_of(begun)
-        return [result_of(call) for call in [pool.submit(_call, method, (*arguments, *mine))
-                                             for pool, mine in zip(self._pools, own)]]
+        return [result_of(call) for call in [pool.submit(_call, method, (*arguments, *one))
+                                             for pool, one in zip(self._pools, further)]]
 
     def close(self) -> None:
-        """End the processes, whatever they do."""
+        """Kill the processes."""
         for pool in self._pools:
             shut(pool)
 
 
 def shut(pool: Any) -> None:
-    """End a pool's process, whatever it does."""
+    """Kill the process of a pool, and wait for its end."""
     with deferred():
         pool.shutdown(wait=True, kill_workers=True)
 
 
 def result_of(call: "Future[Any]") -> Any:
-    """Return what a process that trains gives back.
+    """Return the result of a call in a training process.
 
     Raises:
-        RunFailed: it has ended.
+        RunFailed: the process has ended.
     """
     from loky.process_executor import TerminatedWorkerError
 
@@ -153,10 +148,11 @@ def result_of(call: "Future[Any]") -> Any:
                         "same command with --resume to go on from the last checkpoint") from None
 
 
-_trainer: Any  # of a process that is nothing but a replica's
+_trainer: Any  # the trainer of a replica's process
 
 
 def _begin(made: Callable[..., Any], arguments: tuple) -> None:
+    """Construct the trainer of this process."""
     global _trainer
     limit_threads(1)
     keep_memory()
@@ -164,4 +160,5 @@ def _begin(made: Callable[..., Any], arguments: tuple) -> None:
 
 
 def _call(method: str, arguments: tuple) -> Any:
+    """Call a method of the trainer of this process."""
     return getattr(_trainer, method)(*arguments)

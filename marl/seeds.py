@@ -1,7 +1,7 @@
-"""The same run with several seeds: interquartile means, with bands over seeds (not over flights).
+"""Repeat a run with several seeds; report interquartile means with bootstrap bands over seeds.
 
-Both are those of Agarwal et al., "Deep reinforcement learning at the edge of the statistical
-precipice", NeurIPS 2021.
+After Agarwal et al., "Deep reinforcement learning at the edge of the statistical precipice",
+NeurIPS 2021.
 """
 
 from pathlib import Path
@@ -18,12 +18,12 @@ from radiotwin.io.cells import write_csv
 from radiotwin.io.files import atomic_path
 from radiotwin.runtime.console import print_rows
 
-CONFIDENCE, DRAWS = 0.95, 10_000  # of the bootstrap
+CONFIDENCE, DRAWS = 0.95, 10_000  # of the bootstrap bands
 
 
 def run_seeds(run: RunSettings, learner: LearnerSettings, out: Path, resume: bool,
               seeds: int) -> None:
-    """Run with `run.seed` and those after it, each in a folder of its own, and summarise them.
+    """Run with seeds `run.seed`, `run.seed` + 1, … in subfolders of `out`, and write a summary.
 
     Raises:
         BadInput: as `Session.execute`.
@@ -59,9 +59,10 @@ def run_seeds(run: RunSettings, learner: LearnerSettings, out: Path, resume: boo
 
 
 def over_seeds(ratio: np.ndarray) -> dict[str, float]:
-    """Return the interquartile mean of (S,) shares, and its percentile bootstrap band.
+    """Return the interquartile mean of the shares (S,) of S seeds, and its bootstrap band.
 
-    The band of a single seed is NaN.
+    Returns:
+        `truth_ratio`, `low`, `high`; the band of a single seed is NaN.
     """
     if len(ratio) == 1:
         return {"truth_ratio": float(ratio[0]), "low": np.nan, "high": np.nan}

@@ -1,4 +1,4 @@
-"""One run and its folder: configuration, metrics, checkpoints, comparison, figures."""
+"""Execute one run, and write its folder: configuration, log, checkpoint, comparison, figures."""
 
 import hashlib
 import json
@@ -53,7 +53,7 @@ RECORDED = {
 
 @dataclass(frozen=True)
 class Session:
-    """A run, or one that is to be resumed, and the folder of its results."""
+    """A new or resumed run, and the folder of its results."""
 
     run: RunSettings
     learner: LearnerSettings
@@ -61,21 +61,21 @@ class Session:
     resume: bool
 
     def execute(self) -> tuple[pd.DataFrame, dict[str, list[dict]]]:
-        """Run, write the folder, and print the table.
+        """Run Algorithm 1 and its comparison, write the folder, and print the table.
 
         Returns:
-            The table, and the rounds of each run in it by name.
+            the table of all methods, and the log of each run by its name.
 
         Raises:
-            BadInput: a scene or truth that cannot be used, a folder that is taken, or settings
-                that are not those of the run to be resumed.
+            BadInput: an unusable scene or truth, a folder that is not empty, or settings other than
+                those of the run to be resumed.
         """
         limit_threads(1)
         keep_memory()
         scene = Scene.load(self.run.scene)
         truth = read_truth(scene, self.run.truth)
         truth.require_made_for(scene)
-        # Complain before anything is written.
+        # Check the input before anything is written.
         mission = make_mission(scene, truth, Known.truth(scene), self.run.assignment)
         check_sizes(self.run, self.learner, mission)
         device = torch_device(self.run.device)
@@ -113,19 +113,19 @@ class Session:
         return self._write(scene, truth, main, curves, entries), curves
 
     def _begin_beside(self, stack: ExitStack) -> "list[tuple[RunSettings, Future[list[dict]]]]":
-        """Begin the runs of the comparison, one after the other in a process of their own.
+        """Start the runs of the comparison, one after the other in a process of their own.
 
-        A single replica of QMIX stands there for FedQMIX: it takes a third of the work.
+        FedQMIX is compared by a single replica of QMIX, which takes a third of the work.
 
         Returns:
-            Their settings, and the rows of their logs to come.
+            settings and future log of each run.
         """
-        own = self.run
+        main = self.run
         twins = {"none": (), "twins": ("nn", "log-distance"),
-                 "truth": ("nn", "log-distance", "truth")}[own.compare]
-        algorithm = "qmix" if own.algorithm == "fedqmix" else own.algorithm
-        runs = [own.model_copy(update={"twin": twin, "algorithm": algorithm})
-                for twin in twins if twin != own.twin and learner_class(own.algorithm).learns]
+                 "truth": ("nn", "log-distance", "truth")}[main.compare]
+        algorithm = "qmix" if main.algorithm == "fedqmix" else main.algorithm
+        runs = [main.model_copy(update={"twin": twin, "algorithm": algorithm})
+                for twin in twins if twin != main.twin and learner_class(main.algorithm).learns]
         if not runs:
             return []
         pool, _ = start_process({})
@@ -134,7 +134,7 @@ class Session:
                                   self.out / "compare" / run.twin, self.resume)) for run in runs]
 
     def _claim_folder(self, world: dict[str, str]) -> None:
-        """Make the folder of a new run, or check that it holds the run that is to be resumed."""
+        """Create the folder of a new run, or check that it holds the run to be resumed."""
         path = self.out / "config.json"
         config = {"run": self.run.model_dump(mode="json"),
                   "learner": self.learner.model_dump(mode="json"), "world": world}
@@ -166,6 +166,7 @@ class Session:
 
     def _write(self, scene: Scene, truth: RadioMap, main: Outcome, curves: dict[str, list[dict]],
                entries: list[dict]) -> pd.DataFrame:
+        """Add the baselines, write tables and figures, and print the table."""
         real = make_mission(scene, truth, main.known, self.run.assignment)
         trained_in = real
         if main.twin is not None:
@@ -177,7 +178,7 @@ class Session:
         best = self._baseline("planner", known, known, NO_FLIGHTS) | {
             "method": "clairvoyant", "trained_in": TRAINED_IN["truth"]}
         table = pd.DataFrame([*entries, best])
-        # What all real flights together collected less than the clairvoyant would have.
+        # Regret: data that the clairvoyant plan would have collected in addition on real flights.
         table["regret"] = (table["real_episodes"] * (best["truth_ratio"] - table["real_ratio"])
                            ).where(table["real_episodes"] > 0, 0.0)
         with atomic_path(self.out / "comparison.csv") as temporary:
@@ -201,14 +202,24 @@ class Session:
         return table
 
     def _baseline(self, name: str, trained_in: Mission, real: Mission, flown: dict) -> dict:
-        """Return the row of a method without training; `flown` has the real flights before it."""
+        """Evaluate a method without training.
+
+        Args:
+            name: name of the algorithm.
+            trained_in: mission in which it is prepared.
+            real: mission in the truth, in which it flies.
+            flown: numbers of the real flights on which its map is based.
+
+        Returns:
+            its row of the table.
+        """
         run = self.run.model_copy(update={"algorithm": name})
         learner = make_learner(run, self.learner, trained_in, 1)
         learner.prepare(trained_in, lambda _: None)
         ratio = evaluate(real, learner.policy(stream(run.seed, "decisions")), run.flights,
                          stream(run.seed, "truth evaluation")).ratio(real)
-        # Random flights need no real ones. Greedy flights need the positions and a plan the map:
-        # both come from the real flights, unless the settings give them.
+        # Random flights need no real flights. Greedy flights need positions and a plan needs the
+        # map: both come from real flights, unless the settings provide them.
         free = (name == "random" or run.twin == "truth"
                 or (name in ("greedy", "heuristic") and run.privileged))
         return _entry(name, run.twin, (NO_FLIGHTS if free else flown) | {
@@ -216,33 +227,34 @@ class Session:
 
 
 def require_free(folder: Path, advice: str) -> None:
-    """Refuse a folder that has something in it, BadInput."""
+    """Raise BadInput, with advice, if a folder exists and is not empty."""
     if folder.exists() and (not folder.is_dir() or any(
             not is_temporary(each) for each in folder.iterdir())):
         raise BadInput(f"{folder} exists and is not an empty folder; {advice}")
 
 
 def _entry(method: str, twin: str, row: dict) -> dict:
+    """Return a row of the comparison from a row of a log."""
     trained_in = TRAINED_IN[twin] if learner_class(method).uses_map else ""
     return {"method": method, "trained_in": trained_in,
             **{name: row[name] for name in (*NO_FLIGHTS, "truth_ratio", "truth_ratio_std")}}
 
 
 def flights_text(row: Mapping[str, float]) -> str:
-    """Return the real flights of a row by what they were for: measuring + training + selection."""
+    """Return the numbers of real flights as text: measuring + training + selection."""
     return " + ".join(f"{row[name]:,.0f}" for name in FLIGHTS)
 
 
 def regret_text(row: Mapping[str, float]) -> str:
-    """Return the regret of a row, a dash where it is not known."""
+    """Return the regret of a row as text; a dash if it is not known."""
     return "–" if np.isnan(row["regret"]) else f"{row['regret']:,.1f}"
 
 
 def _compared(run: RunSettings, made: Any, learner: LearnerSettings, folder: Path,
               resume: bool) -> list[dict]:
-    """Run Algorithm 1 in a process of its own, and return the rows of its log.
+    """Run Algorithm 1 in this process for the comparison, and return its log.
 
-    The class of the learner comes with it, for it may be registered by a script.
+    `made` is the class of the learner, which a script may have registered.
     """
     limit_threads(1)
     keep_memory()
@@ -253,14 +265,14 @@ def _compared(run: RunSettings, made: Any, learner: LearnerSettings, folder: Pat
 
 
 def _say_row(row: dict) -> None:
-    """Print a row of the table before the others are there."""
-    where = f" in the {row['trained_in'].removeprefix('the ')}" if row["trained_in"] else ""
-    say(f"{row['method']}{where}, real flights {flights_text(row)}: "
+    """Print a row of the table while other runs continue."""
+    place = f" in the {row['trained_in'].removeprefix('the ')}" if row["trained_in"] else ""
+    say(f"{row['method']}{place}, real flights {flights_text(row)}: "
         f"{row['truth_ratio']:.3f} ± {row['truth_ratio_std']:.3f} collected in the truth")
 
 
 def _world(scene: Scene, truth: RadioMap) -> dict[str, str]:
-    """Return hashes of what must not change before a run is resumed."""
+    """Return hashes of scene and truth, which must not change before a run is resumed."""
     declared = hashlib.sha256(read_bytes(scene.folder / "scene.toml")).hexdigest()
     measured = hashlib.sha256(np.ascontiguousarray(truth.gain_db).tobytes()).hexdigest()
     rest = {name: values.values if values.dtype.kind in "biuf" else values.values.tolist()
@@ -272,7 +284,7 @@ def _world(scene: Scene, truth: RadioMap) -> dict[str, str]:
 
 
 class _Log:
-    """Write `metrics.csv` and TensorBoard events of one folder after every round."""
+    """Callback that writes `metrics.csv` and TensorBoard events after every round."""
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._rows, self._blocks = folder, 0, 0
@@ -294,4 +306,5 @@ class _Log:
 
 
 def _numbers(record: dict) -> dict[str, float]:
+    """Return the values of a record without its counters."""
     return {name: value for name, value in record.items() if name not in ("round", "episodes")}

@@ -1,7 +1,7 @@
-"""Settings of a run and of learning, checked when they are given; each becomes an option.
+"""Settings of a run and of learning, which become command-line options; learners; random streams.
 
-With them: the names of the learners, which are the choices of `--algorithm`, and an independent
-stream of random numbers for every purpose, all from one seed.
+The names of the learners are the choices of `--algorithm`. Each purpose has an independent stream
+of random numbers from one seed.
 """
 
 import functools
@@ -44,13 +44,13 @@ Settings = TypeVar("Settings", bound=BaseModel)
 
 
 def learners() -> dict[str, Any]:
-    """Return `LEARNERS`, and those of installed packages."""
+    """Return `LEARNERS` and the learners of installed packages."""
     others = {point.name: point.value for point in entry_points("radiotwin.learners")}
     return LEARNERS | {name: value for name, value in others.items() if name not in LEARNERS}
 
 
 def learner_class(name: str) -> Any:
-    """Return the class of a learner by its name."""
+    """Import the class of a learner by its name."""
     found = learners()[name]
     if isinstance(found, str):
         module, _, attribute = found.partition(":")
@@ -117,12 +117,13 @@ RUNS: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class Choices:
-    """Annotation of a text setting whose allowed values are listed when they are needed."""
+    """Annotation of a text setting whose allowed values are listed lazily."""
 
     values: Callable[[], list[str]]
 
 
 def _registered(name: str) -> str:
+    """Return the name of a learner; refuse an unknown one."""
     if name not in learners():
         *others, last = (repr(each) for each in learners())
         raise PydanticCustomError("literal_error", f"Input should be {', '.join(others)} or {last}")
@@ -154,8 +155,6 @@ class RunSettings(BaseModel):
     episodes: int = Field(
         800, ge=1, le=10_000_000, description="training episodes of each replica in a round; "
         "preset paper: 1000")
-    guide: Literal["none", "planner"] = Field(
-        "none", description="planner: some of the training flights follow a plan")
     first_flight: Literal["waypoints", "random"] = Field(
         "waypoints", description="the first real flight, when nothing is known: from one random "
         "cell to the next, or a random feasible action in every slot; preset paper: random")
@@ -182,38 +181,34 @@ class RunSettings(BaseModel):
     seed: int = Field(0, ge=0, le=2**31, description="of all random numbers")
 
 
-def check_together(run: RunSettings, learner: LearnerSettings) -> None:
-    """Refuse settings that are allowed one by one, but not together.
+def check_together(learner: LearnerSettings) -> None:
+    """Refuse settings of learning that are allowed one by one, but not together.
 
     Raises:
-        BadInput: a replay memory that is too small, or a guide for something that does not learn.
+        BadInput: a replay memory that is smaller than a batch.
     """
     if learner.batch > learner.replay or learner.parallel > learner.replay:
         raise BadInput(
             f"replay {learner.replay}: it must hold a batch ({learner.batch} flights) and what is "
             f"flown side by side ({learner.parallel}); raise it, or lower batch or parallel")
-    if run.guide != "none" and not learner_class(run.algorithm).learns:
-        able = ", ".join(name for name in learners() if learner_class(name).learns)
-        raise BadInput(f"guide {run.guide}: {run.algorithm} does not learn, so nothing can be "
-                       f"guided; it is for algorithm {able} only")
 
 
 def stream(seed: int, purpose: str, number: int = 0) -> np.random.Generator:
-    """Return the generator of a purpose.
+    """Return an independent random generator for a purpose.
 
     Args:
-        seed: of the run.
+        seed: seed of the run.
         purpose: one of `PURPOSES`.
-        number: of the replica, flight or round, where there are several.
+        number: number of the replica, flight or round.
     """
-    # Counted from 1, because numpy takes [1, 2, 0] for [1, 2].
+    # Counted from 1, since numpy treats the seeds [1, 2, 0] and [1, 2] alike.
     return np.random.default_rng([seed, PURPOSES.index(purpose) + 1, number + 1])
 
 
 def with_settings(*models: type[BaseModel]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Decorate a command: one option for each field of some classes of settings.
+    """Decorate a command with one option for each field of some classes of settings.
 
-    The command gets them as one keyword `given`: field -> text, as `checked` takes it.
+    The command gets the given options as a keyword `given`: field -> text, for `checked`.
     """
     fields = {name: field for model in models for name, field in model.model_fields.items()}
 
@@ -225,8 +220,8 @@ def with_settings(*models: type[BaseModel]) -> Callable[[Callable[..., Any]], Ca
                     **options)
 
         signature = inspect.signature(command)
-        own = [each for each in signature.parameters.values() if each.name != "given"]
-        return with_options(run, signature.replace(parameters=own),
+        parameters = [each for each in signature.parameters.values() if each.name != "given"]
+        return with_options(run, signature.replace(parameters=parameters),
                             {name: (_option(name, field), None) for name, field in fields.items()})
     return decorate
 
@@ -239,7 +234,7 @@ def checked(given: Mapping[str, str], defaults: Settings) -> Settings:
         defaults: values of the fields that are not given.
 
     Raises:
-        BadInput: with the option, the given value, and what is allowed.
+        BadInput: a value that is not allowed; the message names option, value and allowed values.
     """
     values = {name: given[name] for name in type(defaults).model_fields if name in given}
     try:
@@ -253,15 +248,15 @@ def checked(given: Mapping[str, str], defaults: Settings) -> Settings:
 
 
 def settings_of(given: Mapping[str, str]) -> tuple[RunSettings, LearnerSettings]:
-    """Return the settings of a command line: a preset, and what was given besides.
+    """Return the settings of a command line: those of its preset, changed by the given options.
 
     Raises:
-        BadInput: an impossible value, or values that do not go together.
+        BadInput: a value that is not allowed, or values that contradict each other.
     """
     preset = checked(given, RunSettings()).preset
     run = checked(given, RunSettings(**RUNS[preset]))
     learner = checked(given, PRESETS[preset])
-    check_together(run, learner)
+    check_together(learner)
     return run, learner
 
 
@@ -270,6 +265,7 @@ def _flag(name: str) -> str:
 
 
 def _option(name: str, field: FieldInfo) -> Any:
+    """Return the annotation of a field's command-line option, for Typer."""
     default = str(field.default).lower() if isinstance(field.default, bool) else field.default
     text = field.description or ""
     return Annotated[str | None, typer.Option(
@@ -278,6 +274,7 @@ def _option(name: str, field: FieldInfo) -> Any:
 
 
 def _metavar(field: FieldInfo) -> str:
+    """Return the choices or the kind of a field's values, for the help."""
     if get_origin(field.annotation) is Literal:
         return "|".join(get_args(field.annotation))
     for choices in field.metadata:
@@ -288,6 +285,7 @@ def _metavar(field: FieldInfo) -> str:
 
 
 def _allowed(field: FieldInfo) -> str:
+    """Return the allowed values of a field as text, for messages."""
     signs = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
     bounds = [f"{signs[name]} {limit:g}" for bound in field.metadata for name in signs
               if (limit := getattr(bound, name, None)) is not None]

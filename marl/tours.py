@@ -1,4 +1,4 @@
-"""Random changes of tours: the neighbours among which the planner's annealing moves."""
+"""Random changes of tours: the neighbourhood of the planner's simulated annealing."""
 
 import numpy as np
 
@@ -9,29 +9,29 @@ from radiotwin.runtime.compiled import njit
 def change(tour: np.ndarray, count: np.ndarray, only: int, level: np.ndarray, peaks: np.ndarray,
            left: np.ndarray, rows: int, columns: int, rng: np.random.Generator,
            changed: np.ndarray, first: np.ndarray) -> int:
-    """Make one random change of one tour, or of two.
+    """Change one tour, or two, at random in place.
 
     Args:
-        tour: (U, W, 3) waypoints (row, column, hovers) of each UAV.
-        count: (U,) number of them.
+        tour: (U, W, 3) waypoints (row, column, hovers) of each UAV; changed.
+        count: (U,) number of waypoints of each UAV; changed.
         only: UAV whose tour changes; -1 for any.
-        level: (U,) of `Mission`.
+        level: (U,) level of the maps, see `Mission`.
         peaks: (L, K, 2) cell where each device is heard best.
         left: (K,) data that the plan leaves; devices with much of it attract new waypoints.
-        rows: of the lattice.
-        columns: of the lattice.
-        rng: of the change.
-        changed: (2,) gets the UAVs whose tours have changed.
-        first: (2,) gets the first waypoint of each that is another one.
+        rows: number of rows of the lattice.
+        columns: number of columns of the lattice.
+        rng: generator of the change.
+        changed: (2,) output: UAVs whose tours have changed.
+        first: (2,) output: index of the first changed waypoint of each.
 
     Returns:
-        Number of tours that have changed.
+        Number of tours that have changed, 1 or 2.
     """
     u = int(only if only >= 0 else rng.integers(0, len(count)))
-    n, most = count[u], tour.shape[1]
+    n, max_count = count[u], tour.shape[1]
     kind = rng.random()
     changed[0] = u
-    if n < most and (n == 0 or kind < 0.12):  # insert one
+    if n < max_count and (n == 0 or kind < 0.12):  # insert a waypoint
         first[0] = rng.integers(0, n + 1)
         _insert(tour[u], count, u, first[0])
         _draw_waypoint(tour[u, first[0]], peaks[level[u]], left, rows, columns, rng)
@@ -40,14 +40,14 @@ def change(tour: np.ndarray, count: np.ndarray, only: int, level: np.ndarray, pe
     first[0] = at
     if kind < 0.24:
         _delete(tour[u], count, u, at)
-    elif kind < 0.54:  # shift it
+    elif kind < 0.54:  # shift a waypoint by up to two cells
         for axis, limit in ((0, rows), (1, columns)):
             tour[u, at, axis] = min(max(tour[u, at, axis] + rng.integers(-2, 3), 0), limit - 1)
-    elif kind < 0.74:  # hover longer or shorter
+    elif kind < 0.74:  # change its hovers
         tour[u, at, 2] = max(tour[u, at, 2] + rng.integers(-4, 5), 0)
-    elif kind < 0.82:  # move it anywhere
+    elif kind < 0.82:  # replace it
         _draw_waypoint(tour[u, at], peaks[level[u]], left, rows, columns, rng)
-    elif kind < 0.88 or len(count) == 1 or only >= 0:  # change the order
+    elif kind < 0.88 or len(count) == 1 or only >= 0:  # swap two waypoints of the tour
         other = rng.integers(0, n)
         first[0] = min(at, other)
         _exchange(tour[u, at], tour[u, other])
@@ -55,19 +55,19 @@ def change(tour: np.ndarray, count: np.ndarray, only: int, level: np.ndarray, pe
         v = int((u + rng.integers(1, len(count))) % len(count))
         other = rng.integers(0, count[v] + 1)
         changed[1], first[1] = v, other
-        if kind < 0.92:  # exchange with another UAV
+        if kind < 0.92:  # swap a waypoint with another UAV
             if other == count[v]:
                 return 1
             _exchange(tour[u, at], tour[v, other])
-        elif kind < 0.96:  # give to another UAV
-            if count[v] == most:
+        elif kind < 0.96:  # give a waypoint to another UAV
+            if count[v] == max_count:
                 return 1
             _insert(tour[v], count, v, other)
             tour[v, other] = tour[u, at]
             _delete(tour[u], count, u, at)
-        else:  # exchange the rest of the tours
+        else:  # swap the tails of the tours
             rest, others = n - at, count[v] - other
-            if at + others > most or other + rest > most:
+            if at + others > max_count or other + rest > max_count:
                 return 1
             for i in range(max(rest, others)):
                 if i < min(rest, others):
@@ -83,7 +83,7 @@ def change(tour: np.ndarray, count: np.ndarray, only: int, level: np.ndarray, pe
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _insert(tour: np.ndarray, count: np.ndarray, uav: int, at: int) -> None:
-    """Make room for a waypoint in one tour (W, 3)."""
+    """Make room for a waypoint at an index of one UAV's tour (W, 3)."""
     for i in range(count[uav], at, -1):
         tour[i] = tour[i - 1]
     count[uav] += 1
@@ -91,6 +91,7 @@ def _insert(tour: np.ndarray, count: np.ndarray, uav: int, at: int) -> None:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _delete(tour: np.ndarray, count: np.ndarray, uav: int, at: int) -> None:
+    """Delete the waypoint at an index of one UAV's tour (W, 3)."""
     for i in range(at, count[uav] - 1):
         tour[i] = tour[i + 1]
     count[uav] -= 1
@@ -98,6 +99,7 @@ def _delete(tour: np.ndarray, count: np.ndarray, uav: int, at: int) -> None:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _exchange(one: np.ndarray, other: np.ndarray) -> None:
+    """Swap two waypoints (3,) in place."""
     for i in range(len(one)):
         one[i], other[i] = other[i], one[i]
 
@@ -105,7 +107,7 @@ def _exchange(one: np.ndarray, other: np.ndarray) -> None:
 @njit(cache=True, nogil=True, error_model="numpy")
 def _draw_waypoint(waypoint: np.ndarray, peaks: np.ndarray, left: np.ndarray, rows: int,
                    columns: int, rng: np.random.Generator) -> None:
-    """Draw a waypoint near a cell where a device is heard best, or anywhere."""
+    """Draw a waypoint (3,): with probability 0.7 near a device's peak cell, else anywhere."""
     if rng.random() < 0.7:
         k, other = rng.integers(0, len(peaks)), rng.integers(0, len(peaks))
         k = other if left[other] > left[k] else k

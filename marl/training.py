@@ -1,4 +1,4 @@
-"""What training needs besides networks: exploration, memory of whole flights, and batches of it."""
+"""Exploration, replay memory of whole flights, and packed batches for training."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -13,35 +13,30 @@ from marl.mission import MAX_SNR_DB, Mission
 
 
 class Exploration:
-    """Random actions in place of the best ones, each kept for a while.
+    """Temporally extended ε-greedy exploration: random actions that are repeated for some slots.
 
-    Steps of one slot each take a UAV back and forth, and hardly ever across the city. Kept for
-    longer they do: temporally extended ε-greedy exploration (Dabney, Ostrovski and Barreto, ICLR
-    2021), with a geometric distribution in place of their zeta distribution. Each UAV of each
-    flight explores by itself.
+    Independent random moves hardly ever take a UAV across the city (Dabney, Ostrovski and Barreto,
+    ICLR 2021; here with a geometric distribution of lengths). Each UAV explores independently.
 
     Args:
-        epsilon: share of the slots that UAVs spend on excursions.
-        mean_slots: mean length of an excursion, 1 or more; it ends early where its action is not
+        epsilon: share of the slots in which UAVs explore.
+        mean_slots: mean length of an excursion, at least 1; it ends early if its action is not
             feasible.
-        rng: of begin, length and action.
+        rng: random generator.
     """
 
     def __init__(self, epsilon: float, mean_slots: float, rng: np.random.Generator) -> None:
         self._mean_slots, self._rng = mean_slots, rng
-        # Probability that an excursion begins in a slot in which none is under way.
+        # Probability that an excursion begins in a slot without one.
         self._begin = epsilon / (mean_slots - epsilon * (mean_slots - 1))
 
     def start(self, flights: int, uavs: int) -> None:
-        """Forget the flights before."""
+        """Reset the excursions for new flights."""
         self._kept = np.zeros((flights, uavs), dtype=np.int64)
         self._left = np.zeros((flights, uavs), dtype=np.int64)
 
     def change(self, action: np.ndarray, mask: np.ndarray) -> np.ndarray:
-        """Return the actions (E, U) to be flown in this slot, instead of those of the policy.
-
-        The mask (E, U, 6) has the feasible ones.
-        """
+        """Replace some of a policy's actions (E, U) by random feasible ones of a mask (E, U, 6)."""
         begins = (self._rng.random(action.shape) < self._begin) & (self._left == 0)
         lots = np.where(mask, self._rng.random(mask.shape), -1.0).argmax(axis=-1)
         self._kept[begins] = lots[begins]
@@ -52,20 +47,21 @@ class Exploration:
         return np.where(explores, self._kept, action)
 
     def _lengths(self, shape: tuple[int, ...]) -> np.ndarray:
+        """Draw lengths of excursions [slots]."""
         if self._mean_slots == 1:
             return np.ones(shape, dtype=np.int64)
         return self._rng.geometric(1 / self._mean_slots, shape)
 
 
 class Replay:
-    """The last `capacity` flights, in memory allocated once.
+    """Replay memory of the last `capacity` flights, allocated once.
 
-    Frames are kept, and features are made of them when they are sampled: frames take a fifth of
-    the memory, and a flight in an earlier twin is seen with the positions that are known now.
+    It stores frames, from which features are computed when they are sampled. Frames take a fifth of
+    the memory, and features of flights in an earlier twin use today's known positions.
 
     Attributes:
-        capacity: of flights.
-        size: flights that are in it.
+        capacity: largest number of flights.
+        size: present number of flights.
     """
 
     def __init__(self, capacity: int, mission: Mission) -> None:
@@ -75,7 +71,7 @@ class Replay:
             empty_frame(shape, mission), np.zeros((*shape, mission.uavs), np.int8),
             np.zeros((*shape, mission.uavs), np.float32), np.zeros(capacity, np.int32))
         waiting = mission.data_units.astype(np.float32)
-        # Of what may be read from a checkpoint.
+        # Ranges of values that are accepted from a checkpoint.
         self._ranges = {
             "cell": (0, np.array(mission.steps_home.shape[1:]) - 1),
             "battery": (0, mission.battery), "snr_db": (-np.inf, MAX_SNR_DB),
@@ -84,7 +80,7 @@ class Replay:
             "length": (1, mission.longest)}
 
     def add(self, flights: Flights) -> None:
-        """Replace the oldest flights by new ones."""
+        """Store new flights in place of the oldest ones."""
         rows = (self._next + np.arange(len(flights.length))) % self.capacity
         for kept, new in zip(_arrays(self._flights).values(), _arrays(flights).values()):
             kept[rows] = new
@@ -92,7 +88,7 @@ class Replay:
         self.size = min(self.size + len(rows), self.capacity)
 
     def sample(self, count: int, rng: np.random.Generator) -> Flights:
-        """Draw different flights uniformly; cut to the longest of them."""
+        """Draw `count` different flights uniformly, cut to the longest of them."""
         rows, kept = rng.choice(self.size, count, replace=False), self._flights
         slots = kept.length[rows].max()
         return Flights(Frame(*(array[rows, :slots] for array in kept.frames)),
@@ -100,16 +96,16 @@ class Replay:
 
     @property
     def bytes(self) -> int:
-        """Memory in use."""
+        """Allocated memory [bytes]."""
         return sum(array.nbytes for array in _arrays(self._flights).values())
 
     def state(self) -> dict[str, Any]:
-        """Return a checkpoint."""
+        """Return the state for a checkpoint."""
         return {"next": self._next, "size": self.size,
                 **{name: array[:self.size] for name, array in _arrays(self._flights).items()}}
 
     def load_state(self, state: dict) -> None:
-        """Go on from a checkpoint."""
+        """Restore the memory from a checkpoint's state."""
         size = require(state["size"], range(self.capacity + 1), "size")
         arrays = {name: array[:size] for name, array in _arrays(self._flights).items()}
         require(state, {"next": range(self.capacity), "size": ...} | {
@@ -120,16 +116,17 @@ class Replay:
 
 
 def _arrays(flights: Flights) -> dict[str, np.ndarray]:
+    """Return all arrays of a record by name."""
     return flights.frames._asdict() | {"action": flights.action, "collected": flights.collected,
                                        "length": flights.length}
 
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """E flights to learn from, without padding: packed as by `torch.nn.utils.rnn.PackedSequence`.
+    """E flights to learn from, packed as by `torch.nn.utils.rnn.PackedSequence`.
 
-    First all flights in their first slot, then those that still fly in the second, and so on; the
-    longest come first. N is the sum of their lengths, T the longest, U the number of UAVs.
+    Rows are all flights in slot 0, the longest first, then those still flying in slot 1, and so on.
+    N is the sum of their lengths, T the longest, U the number of UAVs.
 
     Attributes:
         observation: (N, U, observation_size)
@@ -156,7 +153,7 @@ class Batch:
     sizes: np.ndarray
 
     def unpacked(self, values: Tensor) -> Tensor:
-        """Return (N, …) values as (T, E, …), 0 behind the end of a flight."""
+        """Unpack values (N, …) to (T, E, …), with 0 after the end of a flight."""
         padded = values.new_zeros(*self.valid.shape[:2], *values.shape[1:])
         padded[self.slot, self.flight] = values
         return padded

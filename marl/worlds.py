@@ -1,7 +1,6 @@
-"""Worlds that a twin holds possible: what its errors leave open, drawn.
+"""Draw possible worlds from a twin's uncertainty, to start a belief and to evaluate plans.
 
-Where devices are, how far their levels and the map are off, which devices do not transmit, and how
-much data wait. A belief begins with them, and a plan is judged in them.
+Uncertain are device positions, device levels, the map, which devices transmit, and their data.
 """
 
 import numpy as np
@@ -15,23 +14,23 @@ from radiotwin.scene.config import ANTENNA_HEIGHT_M
 from radiotwin.twin import Twin
 from radiotwin.twin.shadowing import MapErrors
 
-CANDIDATES, CANDIDATES_ALONG_PATHS = 120, 12  # of a device; paths take seconds for each
-MAX_VALUES = 2e8  # of the candidates' maps: 1.6 GB
-RADIUS_IN_SD = np.sqrt(2 * np.log(10))  # of a normal distribution, the circle with 90 %
-MAX_TRIES = 50  # of a position outside buildings
+CANDIDATES, CANDIDATES_ALONG_PATHS = 120, 12  # positions of a device; paths take seconds for each
+MAX_VALUES = 2e8  # largest number of values in the candidates' maps: 1.6 GB
+RADIUS_IN_SD = np.sqrt(2 * np.log(10))  # 90 % radius of a circular normal distribution [sd]
+MAX_TRIES = 50  # draws until all positions are outside buildings
 
 
 def twin_prior(twin: Twin, scene: Scene, radio_map: RadioMap, rng: np.random.Generator,
                silent: float = 0.0, data_spread: float = 0.0) -> Prior:
-    """Return the belief that a twin begins with.
+    """Return the prior of a belief by a twin's position radii and map errors.
 
     Args:
-        twin: its positions, their radii, and its errors.
-        scene: of the mission.
-        radio_map: the twin's.
-        rng: of the positions.
+        twin: twin with positions, credible radii and map errors.
+        scene: scene of the mission.
+        radio_map: map of the twin, for transmit powers.
+        rng: generator of the positions.
         silent: probability that a device does not transmit.
-        data_spread: see `Prior`.
+        data_spread: relative half-width of each device's data, see `Prior`.
     """
     errors = MapErrors.kept(twin)
     levels = np.unique(levels_of(scene))
@@ -43,7 +42,7 @@ def twin_prior(twin: Twin, scene: Scene, radio_map: RadioMap, rng: np.random.Gen
     most = CANDIDATES_ALONG_PATHS if twin.channel.follows_paths else CANDIDATES
     count = max(min(most, int(MAX_VALUES / (2 * len(names) * len(receiver_m)))), 1)
     drawn_m = np.stack([draw_positions(twin, row, scene, count, rng) for row in rows], axis=1)
-    # A device that the twin has no position for is anywhere; an anchor is where it is.
+    # Anchors have one candidate; devices without a position are drawn anywhere.
     moves = np.array([bool(np.ptp(drawn_m[:, k], axis=0).any()) for k in range(len(names))])
     power_dbm = twin.power_dbm(scene)[rows]
     offset_db = snr_offset_db(scene, radio_map) - power_dbm
@@ -63,7 +62,7 @@ def twin_prior(twin: Twin, scene: Scene, radio_map: RadioMap, rng: np.random.Gen
         snr_db[some, number] = mean_db + offset_db[some, None, None, None]
         sd_db[some, number] = own_sd_db
     weight = np.where(moves[:, None], 1.0 / count, np.arange(count) == 0)
-    # What is common to all devices is not known better than the mean of those that were measured.
+    # The level common to all devices is as uncertain as the mean of the measured devices.
     common_sd_db = errors.level_sd_db / np.sqrt(max(errors.devices, 1))
     return Prior(snr_db, sd_db, weight, np.full(len(names), errors.level_sd_db),
                  float(common_sd_db), np.full(len(names), float(silent)), float(data_spread),
@@ -72,7 +71,7 @@ def twin_prior(twin: Twin, scene: Scene, radio_map: RadioMap, rng: np.random.Gen
 
 def draw_positions(twin: Twin, row: int, scene: Scene, count: int,
                    rng: np.random.Generator) -> np.ndarray:
-    """Draw positions (count, 3) of a twin's device [m], outside buildings; row -1: of none."""
+    """Draw positions (count, 3) of a twin's device by row, outside buildings [m]; zeros for -1."""
     if row < 0:
         return np.zeros((count, 3))
     device = twin.devices[row]
@@ -102,17 +101,17 @@ def draw_positions(twin: Twin, row: int, scene: Scene, count: int,
         pending[pending] = inside | outside
         if not pending.any():
             break
-    if pending.any() and not pending.all():  # hardly any room: of those that were found
+    if pending.any() and not pending.all():  # hardly any free room: repeat those that were found
         drawn_m[pending] = drawn_m[rng.choice(np.flatnonzero(~pending), int(pending.sum()))]
     return drawn_m
 
 
 class WorldSource:
-    """Draws missions that may be the real one, of a belief before take-off.
+    """Generator of possible real missions from a prior.
 
     Args:
-        prior: the belief.
-        mission: as it is believed.
+        prior: prior of the belief.
+        mission: mission in the twin's map.
     """
 
     def __init__(self, prior: Prior, mission: Mission) -> None:
@@ -120,7 +119,7 @@ class WorldSource:
         self._field = CorrelatedField(prior.snr_db.shape[3:], mission.step_m, prior.length_m)
 
     def draw(self, rng: np.random.Generator) -> tuple[Mission, np.ndarray]:
-        """Return a mission, and which devices (K,) transmit in it; no data wait at the others."""
+        """Draw a mission, and the mask (K,) of devices that transmit; the others have no data."""
         prior, mission = self._prior, self._mission
         devices, candidates = prior.weight.shape
         snr_db = np.empty(mission.snr_db.shape, np.float32)

@@ -1,4 +1,4 @@
-"""Plans, planning again, and planning again on a belief, where things are not as thought: `belief`.
+"""Open-loop plans, replanning, and replanning with a belief when assumptions are wrong: `belief`.
 
     python -m studies.generated 3 runs/town && radiotwin trace runs/town
     radiotwin build-scene sionna:munich --bbox=-300,-300,300,300 --altitudes 60,65,70 --step 20
@@ -109,7 +109,7 @@ def fly_believing(seed: int, settings: dict) -> dict:
 
 def _sizing(prior: Prior, believed: Mission, real: Mission, sends: np.ndarray, tries: int,
             seed: int) -> dict:
-    """Return the fewest UAVs that promise enough, and what they and one less collect."""
+    """Return the least sufficient number of UAVs by `promise`, and what it and one less collect."""
     fewer = np.nan
     for uavs in UAVS:
         chosen = [number % believed.uavs for number in range(uavs)]
@@ -135,7 +135,7 @@ def _with_battery(scene: Scene, factor: float) -> Scene:
 
 def _learnt(scene: Scene, truth: object, seed: int, rng: np.random.Generator,
             is_displaced: bool) -> Twin:
-    """Return a twin with the law of the anchors' links of one flight, and thought positions."""
+    """Return a twin fitted to the anchors' links of a flight, with assumed device positions."""
     measured = fly_survey(scene, truth, flights=1, seed=seed)  # type: ignore[arg-type]
     anchors = [each.device for each in scene.config.devices if each.role == "anchor"]
     names = measured.devices["device"].to_numpy()[measured.device_index]
@@ -153,7 +153,7 @@ def _learnt(scene: Scene, truth: object, seed: int, rng: np.random.Generator,
 
 
 def belief_table(rows: pd.DataFrame) -> str:
-    """Return methods, the gap that a belief closes, and promises: over all worlds, and by world."""
+    """Return tables of methods, of the gap closed by a belief, and of predicted shares."""
     law = np.where(rows["name"].str.contains("-segmented-"), "law right", "law wrong")
     scenario = rows["name"].str.rpartition("-")[2]
     heads = ["rows", *METHODS.values(), "gap closed", "without link", "belief below (5 %)"]

@@ -1,8 +1,8 @@
-"""Calibration of evidence: the loop on cases for it, and the regression upon it.
+"""Calibrate the posterior of effects: run the loop on cases, and fit the regression: `calibration`.
 
 The cases are those of the foreign cities for calibration, with their maps and without; some of
 those of the two traced cities whose maps are right within a survey's error (`tests/undeclared`),
-the others of which are left for the studies `hidden` and `null`; and campaigns over open ground.
+the others of which are left for the study `hidden`; and campaigns over open ground.
 
     python -m studies calibration --resume      # rows: the loop on each case
     python -m studies.calibration           # rows -> radiotwin/closeloop/verdict/calibration.json
@@ -42,7 +42,7 @@ def calibration_cases(seed: int) -> dict[str, dict]:
 
 
 def candidates_of(seed: int, settings: dict) -> dict:
-    """Close the loop on a case, and keep what every candidate's probability depends on."""
+    """Close the loop on a case; return the features of every candidate, and whether it is right."""
     family, _, number = settings["case"].partition(":")
     hidden = _case(family, number)
     with warnings.catch_warnings():
@@ -79,7 +79,7 @@ def _case(family: str, number: str) -> Case | ForeignCase | OpenCase:
 
 
 def _is_wrong_map(score: Trial, nuisance: dict | None) -> bool:
-    """Return whether a building of a candidate is missing or gone, though nobody hid it."""
+    """Return whether a candidate names a true error of the map that the case did not hide."""
     if isinstance(score.params, MissingObstacle.Params):
         x_m, y_m = score.params.box.x_m, score.params.box.y_m
     elif isinstance(score.params, RemovedObstacle.Params):

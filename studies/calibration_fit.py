@@ -1,4 +1,4 @@
-"""The regression that says what evidence is worth, and how well it holds on other cities."""
+"""Logistic regression of effects' probabilities, with cross-validation over cities."""
 
 import numpy as np
 import pandas as pd
@@ -21,7 +21,7 @@ BINS = (0.0, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 0.85, 1.0)
 
 
 def usable(rows: list[dict]) -> pd.DataFrame:
-    """Return candidates that passed and of which it is known whether they are right."""
+    """Return the candidates that passed and whose truth is known."""
     found = [(row["name"], name, right, values) for row in rows
              for _, name, passed, values, *_, right in row["results"]["candidates"]
              if passed and name not in (*PHYSICS, *row["results"]["open"])]
@@ -101,7 +101,7 @@ def _places(rows: list[dict]) -> list[str]:
 
 
 def _place(case: str) -> str:
-    """Return what cases are held out together: all of a city, with its map or without."""
+    """Return the label of cases that are held out together: all of one city."""
     return case[:6] if case.startswith("city") else case.removesuffix("-no-map")
 
 
@@ -112,7 +112,7 @@ def _rows(rows: pd.DataFrame) -> list[dict]:
 
 
 def calibration_table(rows: pd.DataFrame) -> str:
-    """Return what passes thresholds of probability, and how often candidates are right by name.
+    """Return tables of candidates over probability thresholds, and of right candidates by name.
 
     Of fewer than `FOLDS` cities only a sentence that says so.
     """
@@ -136,7 +136,7 @@ def calibration_table(rows: pd.DataFrame) -> str:
 
 
 def calibration_figures(rows: pd.DataFrame) -> dict[str, Figure]:
-    """Draw how often candidates of a probability are right."""
+    """Draw the share of right candidates against their probability (reliability)."""
     cases = _rows(rows)
     if len(_places(cases)) < FOLDS:
         return {}

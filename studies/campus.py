@@ -92,7 +92,7 @@ def campus(heights: bool = True) -> Iterator[tuple[Measurements, Scene]]:
 
 
 def campus_cases(seed: int) -> dict[str, dict]:
-    """Return every base held out every way, and controls over a wrong map or wrong levels."""
+    """Return all bases with all ways to hold out, and controls with a wrong map or wrong levels."""
     cases = {f"{split}-{base}": {"split": split, "base": base, "control": None}
              for split in SPLITS for base in BASES}
     for name in CONTROLS | LACKING:
@@ -132,7 +132,7 @@ def find_on_campus(seed: int, settings: dict) -> dict:
 
 
 def _controlled(measured: Measurements, control: str | None, seed: int) -> Measurements:
-    """Return measurements with what a control does; what moves them is the same as moving the map.
+    """Change the measurements for a control; moving them is the same as moving the map.
 
     Only the x of both ends is mirrored, so that distances stay.
     """
@@ -156,7 +156,7 @@ def _controlled(measured: Measurements, control: str | None, seed: int) -> Measu
 
 
 def with_azimuths(measured: Measurements, turned_deg: float = 0.0) -> Measurements:
-    """Return measurements whose devices declare the published azimuths, turned by so much."""
+    """Declare the published azimuths in the devices' table, turned by an angle [degree]."""
     azimuth_deg = (measured.devices["device"].map(AZIMUTHS_DEG) + turned_deg) % 360
     return replace(measured, devices=measured.devices.assign(azimuth_deg=azimuth_deg))
 
@@ -227,13 +227,13 @@ def campus_table(rows: pd.DataFrame) -> str:
 
 
 def _in_90(row: pd.Series) -> list[str]:
-    """Return the shares of held-out readings in 90 % intervals, with the rest and combined."""
+    """Return the shares of held-out readings in 90 % intervals, with shadowing and combined."""
     return [f"{100 * share:.0f} %" if np.isfinite(share) else "–"
             for share in (row["coverage"], row.get("combined_coverage", np.nan))]
 
 
 def _turn_deg(effects: list[dict]) -> float:
-    """Return the angle by which all declared azimuths are off, as found; NaN: they are not used."""
+    """Return the common rotation found of all declared azimuths [degree]; NaN if not used."""
     return next((effect["parameters"]["azimuth_offset_deg"]["value"] for effect in effects
                  if "azimuth_offset_deg" in effect["parameters"]), np.nan)
 

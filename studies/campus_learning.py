@@ -1,4 +1,4 @@
-"""What is learnt from a part of a real campus says of the rest: `readings` and `away`.
+"""Learning curves on a real campus: number of readings, and areas left out: `readings`, `away`.
 
 Each row is a user who has these readings and no others: base, effects and combination are learnt
 from them alone, with blocks of them held out, and so are the other models.
@@ -38,7 +38,7 @@ TWIN, NAMED = "twin", "named effects alone"
 
 
 def learn_from(measured: Measurements, scene: Scene, learnt: np.ndarray, seed: int) -> dict:
-    """Learn from a mask (n,) of readings, and predict all others.
+    """Fit twins to a mask (n,) of readings, and score their prediction of all others.
 
     Returns:
         what was named, `rmse_db` of the others by model, and the `coverage` of the twin's 90 %
@@ -69,7 +69,7 @@ def learn_from(measured: Measurements, scene: Scene, learnt: np.ndarray, seed: i
 
 
 def _rows_of(links: Links, measured: Measurements, chosen: np.ndarray) -> np.ndarray:
-    """Return rows of prepared links that are those of the measurements; some were left out."""
+    """Return the rows of prepared links that belong to chosen measurements."""
     def keys(receiver_m: np.ndarray, device: np.ndarray, level_db: np.ndarray) -> list[tuple]:
         return list(zip(*np.round(receiver_m[:, :2].T, 3), device, level_db))
 
@@ -81,7 +81,7 @@ def _rows_of(links: Links, measured: Measurements, chosen: np.ndarray) -> np.nda
 
 
 def away_cases(seed: int) -> dict[str, dict]:
-    """Return quadrants of the area and sectors of which nothing is learnt.
+    """Return the cases: a quadrant of the area, or a sector, is left out of the training.
 
     Sectors with their azimuths declared, too: what a planner knows of one that is not built.
     """
@@ -91,7 +91,7 @@ def away_cases(seed: int) -> dict[str, dict]:
 
 
 def learn_elsewhere(seed: int, settings: dict) -> dict:
-    """Learn from all but a quadrant or a sector, and predict that."""
+    """Fit to all readings but those of a quadrant or a sector, and predict these."""
     left_out = settings["left_out"]
     with campus() as (measured, scene):
         if settings.get("told"):
@@ -106,7 +106,7 @@ def learn_elsewhere(seed: int, settings: dict) -> dict:
 
 
 def away_table(rows: pd.DataFrame) -> str:
-    """Return errors by what was left out, and those of all quadrants and all sectors."""
+    """Return the table of errors by the part that was left out, and over all parts."""
     models = list(rows.iloc[0]["rmse_db"])
     by_name = rows.set_index("name")
     names = [name for name in away_cases(0) if name in by_name.index]
@@ -135,7 +135,7 @@ def _percent(share: float) -> str:
 
 
 def readings_cases(seed: int) -> dict[str, dict]:
-    """Return numbers of readings, scattered over the campus, and of few drives.
+    """Return the cases: numbers of training readings, scattered or from few squares of ground.
 
     Of undeclared antennas, and with their azimuths declared.
     """
@@ -146,7 +146,7 @@ def readings_cases(seed: int) -> dict[str, dict]:
 
 
 def learn_from_few(seed: int, settings: dict) -> dict:
-    """Learn from some readings, and predict all others."""
+    """Fit to some readings, and predict all others."""
     with campus() as (measured, scene):
         if settings.get("told"):
             measured = with_azimuths(measured)
@@ -155,7 +155,7 @@ def learn_from_few(seed: int, settings: dict) -> dict:
 
 
 def _drawn(measured: Measurements, way: str, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Return rows of the readings that are learnt from: any, or all of some squares of ground."""
+    """Draw the rows of training readings: scattered, or all of some squares of ground."""
     order = rng.permutation(len(measured.table))
     if way == "scattered":
         return np.sort(order[:count])

@@ -1,4 +1,4 @@
-"""What each part of the physics brings on a real campus, by least squares: `terms`.
+"""Error reduction by each physical term on a real campus, by least squares: `terms`.
 
 Levels of the sectors, and the coefficients of each term, are fitted to the links outside a fold.
 The antennas are told (published azimuths), so that no search has a part in the answer.
@@ -31,7 +31,7 @@ def by_class(values: np.ndarray, los: np.ndarray) -> np.ndarray:
 
 
 def quick_terms_of(links: Links) -> dict[str, np.ndarray]:
-    """Return columns (n, …) of the terms that no path is followed for, by name."""
+    """Return the columns (n, …) of terms that need no ray paths, by name."""
     city = links.city
     assert city is not None
     los, decades = links.los.astype(float), np.log10(links.distance_m / 100)
@@ -99,13 +99,13 @@ FEW_MODELS: dict[str, tuple[str, ...]] = {
 
 
 def terms_cases(seed: int) -> dict[str, dict]:
-    """Return what is asked of all readings, with seed 0, and of few."""
+    """Return the settings with all readings (seed 0), and with few."""
     every: dict[str, dict] = {} if seed else {"all": {}, "indoors": {"only": "indoors"}}
     return every | {f"few-{count}": {"readings": count} for count in FEW}
 
 
 def fit_terms(seed: int, settings: dict) -> dict:
-    """Return held-out errors of each model, by split; or those of what few readings teach."""
+    """Fit models of terms; return held-out errors by split, or learning from few readings."""
     with campus() as (measured, scene):
         links = prepare_links(measured, scene)
         if "readings" in settings:
@@ -124,7 +124,7 @@ def fit_terms(seed: int, settings: dict) -> dict:
 
 
 def _learnt_from_few(links: Links, count: int, seed: int) -> dict[str, list[float]]:
-    """Return errors on all readings but a few: of terms, and with their residual by kriging."""
+    """Return errors on all readings but the few learnt from: terms alone, and with kriging."""
     terms, found = quick_terms_of(links), {}
     order = np.random.default_rng(seed).permutation(len(links))
     learnt, others = np.sort(order[:count]), np.sort(order[count:])
@@ -139,7 +139,7 @@ def _learnt_from_few(links: Links, count: int, seed: int) -> dict[str, list[floa
 
 
 def _indoors(level_db: np.ndarray, terms: dict[str, np.ndarray]) -> dict:
-    """Return numbers of links with their receiver indoors, and by how much these are weaker."""
+    """Count links with an indoor receiver, and return how much weaker they are [dB]."""
     chance, told = terms["chance of being indoors"][:, 0], terms["indoors"][:, 0] > 0
     rest_db = _rest_db(terms, MODELS["+ antenna, LoS class"], level_db, chance == 0)
     groups = {"indoors by the map, surely": told & (chance >= SURE),
@@ -161,7 +161,7 @@ def _held_out_rmse_db(terms: dict[str, np.ndarray], chosen: tuple[str, ...], lev
 
 def _rest_db(terms: dict[str, np.ndarray], chosen: tuple[str, ...], level_db: np.ndarray,
              learnt: np.ndarray) -> np.ndarray:
-    """Return levels (n,) less what the terms predict, fitted to the rows that are learnt from."""
+    """Fit the terms to the training rows; return the residual (n,) of all levels [dB]."""
     columns = np.column_stack([terms["sector"], *(terms[each] for each in chosen)])
     weights = np.linalg.lstsq(columns[learnt], level_db[learnt], rcond=None)[0]
     return level_db - columns @ weights

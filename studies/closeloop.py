@@ -1,6 +1,6 @@
-"""What `close-loop` finds in traced cities: `hidden` (an effect is), `null` (nothing is missing).
+"""What `close-loop` finds in traced cities where an effect is hidden: `hidden`.
 
-The oracle of `hidden` is the same base, fitted to the same links with the effect taken out of them;
+The oracle is the same base, fitted to the same links with the effect taken out of them;
 where a building is missing or gone, with the true map, and where a clock is wrong, with the true
 positions.
 """
@@ -16,13 +16,12 @@ import pandas as pd
 import trimesh
 
 from radiotwin import Measurements, Scene, close_loop, make_report
-from radiotwin.closeloop.crossfit import cross_validate, make_bases, make_folds, training_parts
+from radiotwin.closeloop.crossfit import cross_validate, make_bases, make_folds
 from radiotwin.closeloop.search.declared import add_declared
 from radiotwin.closeloop.search.stages import SearchInputs, SearchState, search
 from radiotwin.effects.registry import catalogue
 from radiotwin.links import prepare_links
 from radiotwin.scene.citymap import CityMap
-from radiotwin.twin.model.model import Model
 from studies.runner import Study
 from studies.tables import markdown
 from tests.undeclared.cases import FAMILIES, OUTSIDE, SEEDS, Case, case, stored
@@ -34,7 +33,6 @@ GEOMETRY = ("missing_obstacle", "removed_obstacle")
 ALL = (*FAMILIES, *OUTSIDE)
 BY_TWIN = {f"nothing-twin-{by}": {"family": "nothing", "base": "twin", "hold_out": by}
            for by in ("flight", "device")}
-STEP_DB, DOF = 0.25, 5.0  # of the levels and errors that `draw_from_base` makes
 
 
 def hidden_cases(seed: int) -> dict[str, dict]:
@@ -98,7 +96,7 @@ def base_rmse_db(measurements: Measurements, scene: Scene, base: str, hold_out: 
     links = prepare_links(measurements, scene)
     folds = make_folds(links, 0, hold_out)
     kind = make_bases(scene, 0)[base]
-    model = cross_validate(links, kind, folds, training_parts(links, folds))
+    model = cross_validate(links, kind, folds)
     inputs = SearchInputs(links, kind, folds, tuple(effect() for effect in catalogue()))
     return search(SearchState(model), [add_declared], inputs).model.rmse_db()
 
@@ -230,52 +228,6 @@ def counted(names: Iterable[str]) -> str:
                      for name, count in Counter(names).items())
 
 
-def null_cases(seed: int) -> dict[str, dict]:
-    """Return the base `twin` in its own world."""
-    return {"twin": {"base": "twin", "world": seed % len(SEEDS)}}
-
-
-def find_nothing(seed: int, settings: dict) -> dict:
-    """Close the loop on levels drawn from `base` itself, fitted to the case `nothing`, `world`."""
-    world, base = settings["world"], settings["base"]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        drawn = draw_from_base(world, base, seed)
-        report = make_report(close_loop(drawn, case("nothing", world).scene, base, seed))
-    gains = [(round(each["heldout_nll_gain"], 1), each["name"]) for each in report["candidates"]
-             if each["heldout_nll_gain"] is not None]
-    return summary(report) | {"best": sorted(gains, reverse=True)[:3]}
-
-
-def draw_from_base(world: int, base: str, seed: int) -> Measurements:
-    """Return the case `nothing`, `world`, with levels drawn from a base that was fitted to it.
-
-    Errors are Student's t with the fitted scale; levels are in the receivers' steps, and blank
-    below the limit.
-    """
-    hidden = case("nothing", world)
-    links = prepare_links(hidden.measurements, hidden.scene)
-    kind = make_bases(hidden.scene, 0)[base]
-    twin = kind.fit(links)
-    model = Model.build(links, twin.channel, DOF, device_m=kind.device_m(twin))
-    fit = model.fit()
-    errors = np.random.default_rng(seed).standard_t(DOF, len(links))
-    level_db = fit.readings().mean_db + fit.scale_db[model.group] * errors
-    level_db = np.round(level_db / STEP_DB) * STEP_DB
-    table = hidden.measurements.table.copy()
-    table["gain_db"] = np.where(level_db >= model.limit_db, level_db, np.nan)
-    # A device that the base could not locate has no links in its world.
-    return Measurements(table[model.usable].reset_index(drop=True), hidden.measurements.devices)
-
-
-def null_table(rows: pd.DataFrame) -> str:
-    """Return how often nothing is found."""
-    return ("**Nothing is hidden**, levels drawn from the fitted base: verdict `none` in "
-            f"{(rows['verdict'] == 'none').sum()} of {len(rows)}.")
-
-
 STUDIES = {
     "hidden": Study("What does close-loop find?", find_hidden, hidden_cases, hidden_table,
-                    seeds=len(SEEDS)),
-    "null": Study("Does close-loop find something where nothing is missing?", find_nothing,
-                  null_cases, null_table, seeds=20)}
+                    seeds=len(SEEDS))}

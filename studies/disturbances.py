@@ -1,4 +1,4 @@
-"""Policy, plan and re-planning in missions that are not what was thought: `pays`.
+"""Policy, plan and replanning in missions that differ from the assumptions: `pays`.
 
 In the statistical truth. `volumes`: each device's data evenly from 0 to twice what the mission
 says. `positions`: every device is 20 to 40 m from where the UAVs, and their map, have it. `loss`:
@@ -38,15 +38,14 @@ SCENARIOS = {"nominal": ("as thought", Disturbance()),
              "everything": ("all three", Disturbance(1.0, 1.0))}
 METHODS = {"plan": "open-loop plan", "replan": "re-planning, link",
            "replan-no-link": "re-planning, no link", "policy": "policy, link",
-           "policy-no-link": "policy, no link", "taught": "policy taught by the plan, link",
-           "taught-no-link": "the same, no link", "greedy": "greedy"}
+           "policy-no-link": "policy, no link", "greedy": "greedy"}
 
 
 def pays_cases(seed: int) -> dict[str, dict]:
     """Return every method in every scenario."""
     planner = {"planner_iterations": 60_000}
     needs: dict[str, dict[str, Any]] = {
-        "plan": planner, "policy": LONG, "taught": LONG | planner, "greedy": {},
+        "plan": planner, "policy": LONG, "greedy": {},
         "replan": planner | {"replan_every": 10, "replan_iterations": 1500}}
     return {f"{scene}-{scenario}-{method}": {
         "truth": "segmented", "scene": scene, "scenario": scenario, "flights": 64, "truths": 8,
@@ -90,15 +89,11 @@ def fly_disturbed(seed: int, settings: dict) -> dict:
                               stream(seed, "planning", 1))
     elif method == "greedy":
         policy = HeuristicPolicy(method, stream(seed, "decisions"))
+    elif method == "plan":
+        policy = PlanPolicy(plan(world.believed, settings["planner_iterations"], seed).actions)
     else:
-        actions = None
-        if method != "policy":
-            actions = plan(world.believed, settings["planner_iterations"], seed).actions
-        if method == "plan" and actions is not None:
-            policy = PlanPolicy(actions)
-        else:
-            policy, curve = train(learned, settings["episodes"], LearnerSettings.model_validate(
-                settings["learner"]), flights, seed, actions)
+        policy, curve = train(learned, settings["episodes"], LearnerSettings.model_validate(
+            settings["learner"]), flights, seed)
     ratios = world.fly(policy, flights, stream(seed, "truth evaluation"))
     return {"curve": curve, "truth_ratio": ratios.mean(), "truth_ratio_std": ratios.std(),
             "ratios": ratios.tolist()}
@@ -147,14 +142,12 @@ class DisturbedTrainer(Trainer):
         return DisturbedEnvironment(self.mission, count, self._rng, self.disturbance)
 
 
-def train(world: World, episodes: int, settings: LearnerSettings, flights: int, seed: int,
-          teacher: np.ndarray | None = None) -> tuple[AgentPolicy, dict[str, list]]:
-    """Train QMIX over the missions of a world, one after the other, a block each.
-
-    Some flights follow the actions `(slots, uavs)` of a `teacher` (`Trainer.enter`).
+def train(world: World, episodes: int, settings: LearnerSettings, flights: int,
+          seed: int) -> tuple[AgentPolicy, dict[str, list]]:
+    """Train QMIX over the missions of a world in turn, a block of episodes each.
 
     Returns:
-        The policy that collected most at the checks of so many flights after the blocks; these.
+        the policy that collected most in the checks after the blocks; the checks.
     """
     trainer = DisturbedTrainer(QNetworks, settings, world.believed, episodes, seed)
     trainer.disturbance, agent = world.disturbance, trainer.networks.agent
@@ -162,7 +155,7 @@ def train(world: World, episodes: int, settings: LearnerSettings, flights: int, 
     checks: list[dict[str, float]] = []
     with progress("training", total=episodes) as advance:
         while trainer.episodes < episodes:
-            trainer.enter(world.real[len(checks) % len(world.real)], teacher)
+            trainer.enter(world.real[len(checks) % len(world.real)])
             record = trainer.train(min(BLOCK, episodes - trainer.episodes))
             ratio = float(world.fly(AgentPolicy(agent), flights, stream(seed, "choice")).mean())
             if ratio > max((check["ratio"] for check in checks), default=-1.0):

@@ -1,4 +1,4 @@
-"""Flights with surprises: data volumes that differ from the mission's, and a UAV that fails."""
+"""Environment with disturbances: other data volumes than assumed, and a UAV that fails."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""What `close-loop` says of foreign worlds, of which one half of the cities calibrates, one judges.
+"""Results of `close-loop` in foreign cities; half of them calibrate, half judge: `foreign`.
 
     python -m studies foreign --only calibrate
     python -m studies foreign --only judge

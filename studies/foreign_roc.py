@@ -1,4 +1,4 @@
-"""How well a score tells the cases with an effect from those without it."""
+"""ROC curves: how well a score separates cases with an effect from cases without."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Algorithm 1 and what it is compared with: `curve`, `federation`, `tuning`, `options`."""
+"""Algorithm 1 and what it is compared with: `curve`, `federation`, `tuning`."""
 
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from radiotwin import Scene, segmented_truth
 from radiotwin.runtime.console import progress
 from radiotwin.runtime.cuda import torch_device
 from studies import tables
-from studies.runner import RECORDS, Study, read_rows
+from studies.runner import Study
 from studies.tables import RATIO, Curve, last, markdown, number, over_seeds, with_sd, worlds
 
 CITIES = ("rbm", "rdm")
@@ -129,11 +129,6 @@ def tuning_cases(seed: int) -> dict[str, dict]:
                                           for name, changes in kinds.items()})
 
 
-def options_cases(seed: int) -> dict[str, dict]:
-    """Return the rows of the record: the learner's options, on top of the defaults of then."""
-    return {row["name"]: row["settings"] for row in read_rows("options", RECORDS)}
-
-
 def curve_table(rows: pd.DataFrame) -> str:
     """Return what is collected at the end, and the real episodes that the same ratio takes."""
     parts = []
@@ -197,7 +192,7 @@ def federation_table(rows: pd.DataFrame) -> str:
 
 def options(settings: dict, hidden: tuple[str, ...] = ("scene", "truth", "algorithm"),
             **changed: Any) -> str:
-    """Return what differs from the defaults (some `changed`), as options of `marl.fedqmix`."""
+    """Return the settings that differ from the defaults (some `changed`), as options."""
     defaults = RunSettings(planner_iterations=PLANNER_ITERATIONS).model_dump(mode="json") \
         | LearnerSettings().model_dump() | changed
     given = [f"--{name.replace('_', '-')} {str(value).lower()}" for name, value in settings.items()
@@ -214,24 +209,6 @@ def tuning_table(rows: pd.DataFrame) -> str:
          f"{np.mean(last(seeds['curve'], 'location_error_worst_m')):,.0f}", str(len(seeds))]
         for seeds in runs.values()], f"{title}, model-aided QMIX")
         for title, _, runs in worlds(rows))
-
-
-def options_table(rows: pd.DataFrame) -> str:
-    """Return what each option collects in both cities, options as `marl.fedqmix` has them."""
-    before = {"first_flight": "random", "measure": "policy", "twin_shadowing": "slot",
-              "excursion_slots": 1.0, "algorithm": ""}
-    titles = {"segmented": "The paper's maps, statistical truth", "traced": "Ray-traced truth"}
-    cells: dict[str, dict[str, dict[str, str]]] = {truth: {} for truth in titles}
-    for _, scene, runs in worlds(rows):
-        for seeds in runs.values():
-            settings = seeds["settings"].iloc[0]
-            own = LearnerSettings.model_fields if settings["preset"] == "paper" else ()
-            hidden = ("scene", "truth", "flights", *own)  # the preset says what the learner's are
-            row = cells[settings["truth"]].setdefault(options(settings, hidden, **before), {})
-            row[scene[-3:]] = f"{np.mean(last(seeds['curve'])):.3f}"
-    return "\n\n".join(markdown(["options", "RBM", "RDM"], [
-        [text, *(ratio.get(scene, "") for scene in CITIES)]
-        for text, ratio in cells[truth].items()], title) for truth, title in titles.items())
 
 
 def curve_figures(rows: pd.DataFrame) -> dict[str, Figure]:
@@ -287,5 +264,4 @@ STUDIES = {
     "federation": Study("Does averaging replicas pay?", learn, federation_cases, federation_table,
                         federation_figures),
     "tuning": Study("What brings the learner nearer to the planner?", learn, tuning_cases,
-                    tuning_table),
-    "options": Study("What do the learner's options bring?", learn, options_cases, options_table)}
+                    tuning_table)}

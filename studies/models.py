@@ -1,4 +1,4 @@
-"""How good the channel models are, and where they put devices: `models`."""
+"""Accuracy of the channel models and of their device positions: `models`."""
 
 import pandas as pd
 

@@ -22,8 +22,8 @@ from radiotwin.runtime.execution import Job, open_executor
 
 SCHEMA, RECORDS = "radiotwin.study/1", Path(__file__).parents[1] / "docs" / "results"
 MODULES = {"models": "models", "curve": "learning", "federation": "learning", "tuning": "learning",
-           "options": "learning", "twin": "twins", "quality": "twins", "pays": "disturbances",
-           "hidden": "closeloop", "null": "closeloop", "towers": "twins",
+           "twin": "twins", "quality": "twins", "pays": "disturbances",
+           "hidden": "closeloop",
            "real": "closeloop_real", "injected": "injected", "tracer": "tracer",
            "speed": "speed", "flower": "flower", "engine": "engine", "accuracy": "tracer",
            "campus": "campus", "readings": "campus_learning",

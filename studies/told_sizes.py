@@ -1,4 +1,4 @@
-"""Is an effect of the size that a report says would have been named, named? `sizes`.
+"""Test the reported least sizes: are effects of that size named when added? `sizes`.
 
 Campaigns in which nothing is hidden, over open ground and in cities whose maps are wrong: the loop
 says from which sizes on it would have named what it did not. Effects of that size and of one and a
@@ -35,7 +35,7 @@ def sizes_cases(seed: int) -> dict[str, dict]:
 
 
 def put_in_again(seed: int, settings: dict) -> dict:
-    """Close the loop on a campaign, and on the same one with effects of the sizes it tells."""
+    """Close the loop on a campaign, then again with effects of the reported least sizes added."""
     kind, _, number = settings["case"].partition(":")
     case = open_case(int(number)) if number else foreign_case(kind)
     loop = _close(case.measurements, case.scene, seed)
@@ -184,7 +184,7 @@ BY_SIGHT = frozenset({"missing_obstacle"})  # over a city it would stand among b
 
 
 def sizes_table(rows: pd.DataFrame) -> str:
-    """Return how often effects of the sizes told are named, by family."""
+    """Return the table of how often effects of the reported sizes are named, by family."""
     again = pd.DataFrame([[row["name"], family, size, times, family in named,
                            any(name != family for name in named if name not in row["named"])]
                           for row in rows.to_dict("records")

@@ -1,13 +1,9 @@
-"""How good a twin is, and how good it is to train in: `quality`, `twin`, `towers`."""
+"""Accuracy of twins, and value of training in them: `quality`, `twin`."""
 
-import shutil
-import xml.etree.ElementTree as ElementTree
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-import trimesh
 from matplotlib.figure import Figure
 
 from marl.algorithm1 import Reality, location_errors_m, twin_mission
@@ -23,14 +19,12 @@ from radiotwin import (
     Measurements,
     RadioMap,
     Scene,
-    SolverSettings,
     Twin,
     close_loop,
     corrected_twin,
     fit_twin,
     fly_survey,
     score_map,
-    trace_map,
 )
 from radiotwin.runtime.console import progress
 from studies import tables
@@ -51,10 +45,6 @@ REPLAYS = 10  # of a sequence of actions in a twin, whose shadowing differs from
 LONG = {"episodes": 4000, "learner": PRESETS["fast"].model_copy(
     update={"epsilon_slots": 87_500}).model_dump(mode="json")}
 """Settings of a policy that is trained in one map."""
-TOWERS = Path("runs/towers")  # keeps the traced map, which takes a quarter of an hour
-SIDE_M, HEIGHT_M = 20.0, 52.0  # of a tower; below the UAVs
-TOWERS_M = [[496.9, 207.9], [51.0, 348.0]]  # drawn once: free ground 18 to 45 m from devices
-TRAINED_IN = {"twin": "nn", "corrected twin": "corrected", "truth": "truth"}
 
 
 def quality_cases(seed: int) -> dict[str, dict]:
@@ -199,47 +189,6 @@ def fidelity(real: Mission, twin: Mission, flights: int, seed: int) -> dict[str,
     return found
 
 
-def towers_cases(seed: int) -> dict[str, dict]:
-    """Return what FedQMIX trains in."""
-    return {name: {"scene": "rbm", "algorithm": "fedqmix", "episodes": 3000, "trained_in": name}
-            for name in TRAINED_IN}
-
-
-def train_with_towers(seed: int, settings: dict) -> dict:
-    """Train in a twin of a city with two towers that no map shows, and fly in the truth."""
-    scene = Scene.load(tables.scene_folder(settings["scene"]))
-    truth = trace_map(with_towers(scene, TOWERS / "truth"), SolverSettings(), TOWERS / "truth.nc")
-    truth.dataset.attrs["scene_hash"] = scene.content_hash()  # nobody knows that it is another city
-    measured = _survey(scene, truth, 5, 1.0, seed)
-    twin = _learnt(TRAINED_IN[settings["trained_in"]], seed, scene, measured)
-    run = RunSettings(algorithm=settings["algorithm"], episodes=settings["episodes"], seed=seed,
-                      real_episodes=1, flights=16, twin_shadowing="slot")
-    reality = Reality(scene, truth, run.assignment, 0.0, seed)
-    result = train_and_fly(reality, twin, run, PRESETS["fast"])[0]
-    errors = {} if twin is None else _errors(twin, scene, truth)
-    return {"trained_ratio": result["trained_twin_ratio"],
-            "truth_ratio": result["trained_truth_ratio"],
-            "map_rmse_db": errors.get("map_rmse_db"), "towers_m": TOWERS_M}
-
-
-def with_towers(scene: Scene, folder: Path) -> Scene:
-    """Write a copy of a scene folder with towers of concrete in it, unless it is there."""
-    if not (folder / "scene.toml").exists():
-        shutil.copytree(scene.folder, folder, ignore=shutil.ignore_patterns("cache", "truth*.nc"),
-                        dirs_exist_ok=True)
-        tree = ElementTree.parse(folder / "city.xml")
-        for index, middle_m in enumerate(TOWERS_M):
-            box = trimesh.creation.box(extents=[SIDE_M, SIDE_M, HEIGHT_M])
-            box.apply_translation([*middle_m, HEIGHT_M / 2])
-            box.export(folder / "meshes" / f"tower_{index}.ply")
-            tree.getroot().append(ElementTree.fromstring(
-                f'<shape type="ply" id="mesh-tower_{index}"><string name="filename" '
-                f'value="meshes/tower_{index}.ply"/><boolean name="face_normals" value="true"/>'
-                '<ref id="mat-concrete" name="bsdf"/></shape>'))
-        tree.write(folder / "city.xml", encoding="utf-8", xml_declaration=True)
-    return Scene.load(folder)
-
-
 def _survey(scene: Scene, truth: RadioMap, flights: int, noise_db: float,
             seed: int) -> Measurements:
     return fly_survey(scene, truth, flights=flights, pattern=PATTERN, seed=seed,
@@ -314,17 +263,6 @@ def twin_table(rows: pd.DataFrame) -> str:
         "from greedy to random, collect in both.")
 
 
-def towers_table(rows: pd.DataFrame) -> str:
-    """Return what is collected in the truth, by seed."""
-    wide, kinds = rows.pivot(index="seed", columns="name"), list(TRAINED_IN)
-    ratio, error_db = wide["truth_ratio"][kinds], wide["map_rmse_db"]
-    lines = [[str(seed), *map("{:.3f}".format, each),
-              "{:.1f} → {:.1f}".format(*error_db.loc[seed, kinds[:2]])]
-             for seed, each in ratio.iterrows()]
-    table = markdown(["seed", *kinds, "error of the map, twin → corrected [dB]"], lines)
-    return f"{table}\n\nMean: {', '.join(map('{:.3f}'.format, ratio.mean()))}."
-
-
 def quality_figures(rows: pd.DataFrame) -> dict[str, Figure]:
     """Draw errors of the map and of positions against real episodes."""
     found = list(worlds(rows))
@@ -366,6 +304,4 @@ STUDIES = {
     "quality": Study("How good is the twin after how many real episodes?", judge_twin,
                      quality_cases, quality_table, quality_figures),
     "twin": Study("Which twin is worth training in?", train_in, twin_cases, twin_table,
-                  twin_figures),
-    "towers": Study("What do two towers that no map shows cost a learner?", train_with_towers,
-                    towers_cases, towers_table)}
+                  twin_figures)}

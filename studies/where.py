@@ -1,4 +1,4 @@
-"""Where the scan says that something is, against what is hidden, and a pivot table beside it.
+"""Compare the groups found by the scan, and by pivot tables, with the hidden effects: `where`.
 
     python -m studies where --only calibrate
     python -m studies where --only undeclared
@@ -64,7 +64,7 @@ def where_cases(seed: int) -> dict[str, dict]:
 
 
 def say_where(seed: int, settings: dict) -> dict:
-    """Scan a case, and compare the groups that are said with those of the hidden effects."""
+    """Scan a case, and compare the groups found with the links of the hidden effects."""
     measurements, scene, effects, changes_db, true_los = hidden_case(settings)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -172,7 +172,7 @@ def _said(group: Group, sure: float, size: float, hidden: list[Truth], wrong: np
 
 
 def where_table(rows: pd.DataFrame) -> str:
-    """Return how often where is right and groups are not there, by split."""
+    """Return the table of right and false groups, by split."""
     rows = rows.assign(split=rows["name"].str.split("/").str[0])
     splits = {split: list(part.itertuples()) for split, part in rows.groupby("split")}
     figures = [_figures(part) for part in splits.values()]
@@ -194,7 +194,7 @@ def counts(one: dict) -> bool:
 
 
 def false_groups(row: Any, of: str = "said") -> list[dict]:
-    """Return groups that are said with certainty and are not there."""
+    """Return the groups reported with certainty that belong to no hidden effect."""
     return [each for each in getattr(row, of) if each["is"] == "not there"
             and (of != "said" or each["sure"] >= SURE)]
 

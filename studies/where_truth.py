@@ -1,4 +1,4 @@
-"""Which groups of links are those of a hidden effect, and whether a group that is said is one.
+"""Match groups of links with the links of hidden effects.
 
 An effect *acts* on the links that it changes by at least a quarter of its RMS change on the links
 that it changes at all; of an effect of nearly all links (rain), by what it changes more or less
@@ -87,7 +87,7 @@ class Truth:
 
 
 def rows_of_links(links: Links, measurements: Measurements) -> np.ndarray:
-    """Return (n,) the row of the table that each link is of."""
+    """Return the row (n,) of the measurements' table for each link."""
     names = {"device": links.device_names, "receiver": links.receiver_names,
              "flight": links.flight_names}
     of_links = {end: np.array(name, dtype=object)[getattr(links, end)]
@@ -163,7 +163,7 @@ def _places_m(effect: dict) -> np.ndarray:
 
 
 def visibility(truth: Truth, residual_db: np.ndarray, links: Links) -> float | None:
-    """Return t of the residual regressed on what the effect truly changes, were that known.
+    """Return the t statistic of the residual regressed on the effect's true change.
 
     Each class of sight has its own mean and scale, and residuals count up to four scales. Readings
     of a device on one flight at one place of 25 m count as one. None: it changes no level, or all
@@ -212,7 +212,7 @@ def where_is_right(groups: Sequence[Group], truth: Truth, heard: np.ndarray) -> 
 
 
 def holds_mostly(group: Group, acts: np.ndarray, heard: np.ndarray) -> bool:
-    """Return whether a group's links are mostly links that are acted on (n,)."""
+    """Return whether an effect acts on most detected links of a group; `acts` (n,) bool."""
     rows = np.zeros(len(heard), dtype=bool)
     rows[group.rows] = True
     rows &= heard | acts

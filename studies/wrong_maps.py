@@ -1,4 +1,4 @@
-"""How good predictions and radii are where the 3D map is wrong: `maps`.
+"""Accuracy of predictions and radii over wrong 3D maps: `maps`.
 
 The twins are given maps with errors of cities (`studies.wrong_cities`) whose truth is Sionna RT's,
 over the true city, deeper and with more rays than the package traces by default.
@@ -203,7 +203,7 @@ def judge_map(seed: int, settings: dict) -> dict:
 
 
 def anchors_outdoors(world: World, settings: dict, rng: np.random.Generator) -> list[Building]:
-    """Return a wrong map that has no anchor in a building: that, a user would have seen."""
+    """Draw a wrong map without an anchor inside a building, which a user would have noticed."""
     anchors = points(world.device_m[np.array(world.roles) == "anchor", :2])
     while True:
         found = wrong_map(true_city(settings["city"]), settings["wrong"], rng)
@@ -330,7 +330,7 @@ def _rmse(rows: pd.DataFrame, model: str) -> float:
 
 
 def _wins(rows: pd.DataFrame) -> int:
-    """Return in how many worlds the combined twin's error is at most the least of the others."""
+    """Count the worlds in which the combined twin's error is the least."""
     return sum(row[COMBINED]["rmse_db"]["all"] <= min(row[each]["rmse_db"]["all"]
                                                      for each in SIMPLE)
                for _, row in rows.iterrows())

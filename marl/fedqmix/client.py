@@ -1,7 +1,7 @@
-"""One party of a federation: a scene, flights or measurements, and a replica that learns in them.
+"""One party of a federation: its scene, its flights or measurements, and its replica of FedQMIX.
 
-It does what `marl.algorithm1` does, driven from outside: the mean of all replicas comes in, and the
-weights of this one go out. Nothing else is returned.
+It runs Algorithm 1 as the coordinator asks: the mean weights come in, the replica's weights go out.
+Nothing else is returned.
 """
 
 import time
@@ -35,15 +35,15 @@ from radiotwin.scene import Scene
 
 @dataclass(frozen=True)
 class Party:
-    """Data of one party, which nobody else sees.
+    """Private data of one party.
 
     Attributes:
-        scene: its folder.
-        folder: of its checkpoint and results.
-        number: of its replica, whose random numbers it learns with. Its real flights are drawn by
-            the run's seed alone, as those of a single owner's replicas are.
-        truth: see `RunSettings.truth`; real flights are simulated in this map.
-        measurements: of flights that were flown; None: they are simulated.
+        scene: folder of its scene.
+        folder: folder of its checkpoint and results.
+        number: number of its replica, for random numbers of learning. Its real flights depend on
+            the run's seed only, as with a single owner.
+        truth: map of simulated real flights, see `RunSettings.truth`.
+        measurements: file of measurements; None: flights are simulated.
         device: torch device.
     """
 
@@ -56,12 +56,12 @@ class Party:
 
 
 class Client:
-    """A party that trains when it is asked to, and goes on from the checkpoint in its folder.
+    """A party that trains on request, and continues from the checkpoint in its folder.
 
     Args:
-        run: settings that all parties share; scene and truth are the party's own.
-        settings: of learning, shared too.
-        party: what is its own.
+        run: settings common to all parties; scene and truth are the party's own.
+        settings: common settings of learning.
+        party: private data.
 
     Attributes:
         sizes: numbers of UAVs and devices of its scene.
@@ -95,14 +95,14 @@ class Client:
                 self._replica.go_on(mission, state["replica"])
 
     def train(self, number: int, mean: Weights) -> tuple[Weights, int]:
-        """Train for a round from a mean, and write the checkpoint.
+        """Train for a round from the mean weights, and write the checkpoint.
 
         Args:
-            number: of the round, from 1; rounds may have been missed.
-            mean: of the round before; at first the initial weights.
+            number: number of the round, from 1; rounds may have been missed.
+            mean: mean weights of the round before; at first the initial weights.
 
         Returns:
-            The weights, and the number of training episodes behind them.
+            the trained weights, and the number of training episodes.
 
         Raises:
             BadInput: no such round, or weights of other names, shapes or values.
@@ -127,10 +127,10 @@ class Client:
         return weights, episodes
 
     def finish(self, mean: Weights) -> int:
-        """Evaluate the last mean's policy; write its row of the log and the checkpoint.
+        """Evaluate the policy of the last mean weights; write the log and the checkpoint.
 
         Returns:
-            The number of flights of the evaluation.
+            the number of flights of the evaluation.
         """
         self._judge(mean)
         if self._entered:
@@ -139,7 +139,7 @@ class Client:
         return self._run.flights
 
     def _judge(self, mean: Weights) -> None:
-        """Keep the policy of a mean if it is the best so far."""
+        """Check mean weights, and keep their policy if it is the best so far."""
         require_weights(mean, self._replica.weights())
         if self._done:
             self._replica.judge(mean)
@@ -170,7 +170,7 @@ class Client:
 
 
 def _campaign(run: RunSettings, scene: Scene, party: Party) -> Campaign:
-    """Return the campaign of a party; where flights were flown there may be no map of the truth."""
+    """Return the campaign of a party; with measurements, a map of the truth is optional."""
     measured, truth = None, None
     if party.measurements is not None:
         if run.twin == "truth":

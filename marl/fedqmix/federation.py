@@ -1,4 +1,4 @@
-"""FedQMIX: one QMIX replica for each UAV, averaged from time to time (the paper, Sec. III-C)."""
+"""FedQMIX: a QMIX replica for each UAV, with periodic averaging of weights (paper, Sec. III-C)."""
 
 from collections.abc import Mapping, Sequence
 
@@ -16,17 +16,16 @@ Weights = dict[str, np.ndarray]
 
 
 def average(replicas: list[Weights]) -> Weights:
-    """Return the mean of each weight over the replicas, in new memory (paper, Eq. 14)."""
+    """Average the weights of replicas (paper, Eq. 14), rounded to their type."""
     mean = weighted_mean(replicas, [1] * len(replicas))
     return {name: mean[name].astype(first.dtype) for name, first in replicas[0].items()}
 
 
 def weighted_mean(replicas: Sequence[Weights], counts: Sequence[int]) -> Weights:
-    """Return the mean of each weight in double precision, whatever the order of the replicas.
+    """Average the weights of replicas by their episode counts, in double precision.
 
-    Federated averaging by the counts of the episodes behind each (McMahan et al., AISTATS 2017).
-    Products and sums of a few weights in single precision are exact in double precision, but for
-    weights of very different sizes.
+    This is federated averaging (McMahan et al., AISTATS 2017). Sums of a few single-precision
+    weights are practically exact, so the order of replicas does not matter.
     """
     return {name: sum((weights[name].astype(float) * count
                        for weights, count in zip(replicas, counts, strict=True)),
@@ -35,10 +34,10 @@ def weighted_mean(replicas: Sequence[Weights], counts: Sequence[int]) -> Weights
 
 
 def require_weights(given: Mapping[str, np.ndarray], like: Weights) -> None:
-    """Refuse weights that are not like those of these networks: they come from somebody else.
+    """Refuse weights from another party that differ in form from these networks' weights.
 
     Raises:
-        BadInput: they differ, are not finite, or are negative where squares are averaged.
+        BadInput: other names, shapes or types; values that are not finite; negative squares.
     """
     if set(given) != set(like):
         odd = sorted(set(given) ^ set(like))[0]
@@ -55,7 +54,7 @@ def require_weights(given: Mapping[str, np.ndarray], like: Weights) -> None:
 
 
 def initial_weights(shared: Shared) -> Weights:
-    """Return the weights that `FedQMIX` begins with, from the sizes alone."""
+    """Return the initial weights of `FedQMIX`, which depend on seed and array sizes only."""
     links = np.zeros((shared.uavs, shared.devices, 1, 1), np.float32)
     each = np.zeros(shared.uavs, np.int64)
     sizes = Mission(links, links, np.zeros((shared.uavs, 1, 1), np.int64),
@@ -66,10 +65,10 @@ def initial_weights(shared: Shared) -> Weights:
 
 
 def rounds_of(run: RunSettings, settings: LearnerSettings) -> list[tuple[int, int]]:
-    """Return (real episode from 0, training episodes) of each round of a federation.
+    """Return (number of the real episode, training episodes) of each round of a federation.
 
-    They are the blocks of `FedQMIX`: a mean after every `federate_every` episodes, and after the
-    last one before the next real episode.
+    Rounds are the blocks of `FedQMIX`: weights are averaged after every `federate_every` episodes,
+    and before the next real episode.
     """
     blocks = [min(settings.federate_every, run.episodes - start)
               for start in range(0, run.episodes, settings.federate_every)]
@@ -77,11 +76,10 @@ def rounds_of(run: RunSettings, settings: LearnerSettings) -> list[tuple[int, in
 
 
 class FedQMIX(QMIX):
-    """`--algorithm fedqmix`: as `QMIX`, with a replica for each UAV.
+    """`--algorithm fedqmix`: `QMIX` with a replica for each UAV.
 
-    Each replica has an environment, replay memory, exploration, target network and optimiser of
-    its own. After every block of `federate_every` episodes their weights are averaged, and each
-    gets a copy.
+    Each replica has its own environment, replay memory, exploration, target network and optimiser.
+    After every block of `federate_every` episodes all replicas continue from the mean weights.
     """
 
     def __init__(self, setup: Setup) -> None:
@@ -95,13 +93,13 @@ class FedQMIX(QMIX):
 
 
 class Replica(QMIX):
-    """One of the replicas of `FedQMIX`, alone: the mean is made elsewhere."""
+    """A single replica of `FedQMIX`, whose weights the coordinator averages."""
 
     def __init__(self, setup: Setup, number: int) -> None:
         super().__init__(setup, [number])
 
     def train(self, mean: Weights, episodes: int) -> Weights:
-        """Train for some episodes from a mean, and return the weights."""
+        """Train for some episodes from mean weights, and return the weights."""
         self._trainers.call("set_weights", mean)
         _, weights = self._train(episodes)
         self.episodes += episodes
@@ -112,7 +110,7 @@ class Replica(QMIX):
         return self._trainers.call("weights")[0]
 
     def go_on(self, mission: Mission, state: dict) -> None:
-        """Go on from a checkpoint, in the map of that time."""
+        """Restore the replica from a checkpoint's state, in the mission of that time."""
         self.load_state(state)
         self.mission = mission
-        self._trainers.call("enter", mission, self._actions)
+        self._trainers.call("enter", mission)

@@ -1,11 +1,8 @@
-"""The Flower App: parties that train when they are asked, and a coordinator that makes the means.
+"""Flower App of a federation: parties train on request, a coordinator averages their weights.
 
-The ClientApp sends weights and counts. What its party holds is named in `--node-config` of the
-party's own SuperNode. Flower's simulation engine has no such thing: there the run's setting
-`parties` names a file of all of them.
-
-The ServerApp checks what parties sent, averages it, and writes into the folder that the run's
-setting `out` names.
+The ClientApp sends weights and episode counts. Its party's files are named in `--node-config` of
+the party's SuperNode; for Flower's simulation engine, the run's setting `parties` names a file with
+all parties. The ServerApp checks the replies, averages them, and writes to the folder `out`.
 """
 
 import os
@@ -59,29 +56,30 @@ server_app = ServerApp()
 
 
 def arrays_of(weights: Weights) -> ArrayRecord:
-    """Return weights as they are sent: means in double precision, for they are not rounded yet."""
+    """Convert weights for sending, in double precision, since means are not rounded yet."""
     return ArrayRecord({name: Array(array.astype(np.float64)) for name, array in weights.items()})
 
 
 def weights_of(message: Message) -> Weights:
-    """Return the weights in a message, in single precision."""
+    """Extract the weights of a message, in single precision."""
     [record] = message.content.array_records.values()
     return {name: np.asarray(array.numpy(), np.float32) for name, array in record.items()}
 
 
 @client_app.train()
 def train(message: Message, context: Context) -> Message:
-    """Train for a round from the mean, and reply with weights and the number of episodes."""
+    """Train for a round from the mean weights; reply with weights and the number of episodes."""
     return _reply(message, context)
 
 
 @client_app.evaluate()
 def evaluate(message: Message, context: Context) -> Message:
-    """Evaluate the last mean for the party's own log, and reply with the number of flights."""
+    """Evaluate the last mean weights for the party's log; reply with the number of flights."""
     return _reply(message, context)
 
 
 def _reply(message: Message, context: Context) -> Message:
+    """Train or evaluate, by the type of a message; on any error reply without details."""
     try:
         limit_threads(1)
         keep_memory()
@@ -105,10 +103,10 @@ def _reply(message: Message, context: Context) -> Message:
 
 
 def party_of(context: Context, shared: Shared) -> Party:
-    """Return what this node's party holds.
+    """Return the party of this node from its configuration.
 
     Raises:
-        BadInput: something is missing or unknown in its configuration.
+        BadInput: an entry is missing or unknown.
     """
     given: dict[str, Any] = dict(context.node_config)
     if "partition-id" in given:  # of the simulation engine
@@ -134,7 +132,7 @@ def party_of(context: Context, shared: Shared) -> Party:
 
 @server_app.main()
 def main(grid: Grid, context: Context) -> None:
-    """Run all rounds, then have each party evaluate its policy for itself."""
+    """Coordinate all rounds, then ask each party to evaluate its policy."""
     shared = Shared.of(context.run_config)
     like = mean = initial_weights(shared)
     folder = Path(shared.out or f"federation-{context.run_id}")
@@ -161,13 +159,13 @@ def main(grid: Grid, context: Context) -> None:
         shared.clients)
 
 
-def usable(replies: list[Message], like: Weights, most: int) -> list[tuple[Weights, int]]:
-    """Return weights and counts of the replies that have them; say what is left out.
+def usable(replies: list[Message], like: Weights, max_count: int) -> list[tuple[Weights, int]]:
+    """Return weights and episode counts of the valid replies, and log the others.
 
     Args:
-        replies: of parties, which may send anything.
-        like: weights of the right names and shapes.
-        most: episodes of the round.
+        replies: replies of parties, which may contain anything.
+        like: weights with the right names and shapes.
+        max_count: episodes of the round.
     """
     found = []
     for reply in replies:
@@ -177,8 +175,8 @@ def usable(replies: list[Message], like: Weights, most: int) -> list[tuple[Weigh
             weights, [metrics] = weights_of(reply), reply.content.metric_records.values()
             count = metrics["num-examples"]
             require_weights(weights, like)
-            if type(count) is not int or not 1 <= count <= most:
-                raise BadInput(f"it counts {count} episodes; allowed are 1 to {most}")
+            if type(count) is not int or not 1 <= count <= max_count:
+                raise BadInput(f"it counts {count} episodes; allowed are 1 to {max_count}")
             found.append((weights, count))
         except (BadInput, KeyError, TypeError, ValueError) as error:
             log(WARNING, "a party's reply is left out: %.200s", error)
@@ -186,7 +184,7 @@ def usable(replies: list[Message], like: Weights, most: int) -> list[tuple[Weigh
 
 
 def keep(number: int, mean: Weights, rows: list[dict], folder: Path) -> None:
-    """Write the mean of a round, or the initial weights, and the table of the rounds."""
+    """Write the mean weights of a round (0: the initial weights), and the table of rounds."""
     save_checkpoint({"round": number, "weights": {
         name: array.astype(np.float32) for name, array in mean.items()}},
         folder / "weights" / f"round-{number:05d}.safetensors")
@@ -196,7 +194,7 @@ def keep(number: int, mean: Weights, rows: list[dict], folder: Path) -> None:
 
 
 def _ask(grid: Grid, shared: Shared, kind: str, mean: Weights, number: int) -> list[Message]:
-    """Send a mean to all parties that are there, and return their replies."""
+    """Send mean weights to all connected parties, and return their replies."""
     content = RecordDict({"arrays": arrays_of(mean),
                           "config": ConfigRecord({"server-round": number})})
     messages = [Message(content, node, kind) for node in grid.get_node_ids()]
@@ -204,7 +202,7 @@ def _ask(grid: Grid, shared: Shared, kind: str, mean: Weights, number: int) -> l
 
 
 def _wait(grid: Grid, count: int, timeout_s: float) -> None:
-    """Wait for some parties; after a while go on with those that are there."""
+    """Wait until `count` parties are connected, at most for a timeout [s]."""
     end = time.monotonic() + timeout_s
     while len(list(grid.get_node_ids())) < count and time.monotonic() < end:
         time.sleep(0.5)

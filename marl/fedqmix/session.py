@@ -1,4 +1,4 @@
-"""A federation of parties with scenes of their own, and its folder."""
+"""Execute a federation of parties with their own scenes, and write its folder."""
 
 import json
 from dataclasses import asdict, dataclass
@@ -24,7 +24,7 @@ from radiotwin.scene import Scene
 class FederatedSession:
     """A federation and the folder of its results.
 
-    The run's scene is that of all parties that have none of their own.
+    Without `--party-scenes` all parties have the run's scene.
     """
 
     run: RunSettings
@@ -33,11 +33,11 @@ class FederatedSession:
     out: Path
 
     def execute(self) -> None:
-        """Run, write the folder, and print the table; or write the app for Flower.
+        """Run the federation, write the folder, and print the table; or only write the Flower App.
 
         Raises:
-            BadInput: scenes that do not go together, settings that do not, or a folder that is
-                taken.
+            BadInput: scenes of different sizes, contradictory settings, or a folder that is not
+                empty.
         """
         limit_threads(1)
         keep_memory()
@@ -60,6 +60,7 @@ class FederatedSession:
         self._show(parties)
 
     def _parties(self) -> list[Party]:
+        """Return the parties named by the settings."""
         scenes = _listed(self.federation.party_scenes)
         measured = _listed(self.federation.party_measurements)
         if not scenes:
@@ -74,7 +75,7 @@ class FederatedSession:
                 for number, scene in enumerate(scenes)]
 
     def _shared(self, parties: list[Party], sizes: list[tuple[int, int]]) -> Shared:
-        """Return what the parties share, after a look at whether they can."""
+        """Return the common settings; refuse parties whose numbers of UAVs or devices differ."""
         for party, size in zip(parties, sizes):
             if size != sizes[0]:
                 raise BadInput(f"{parties[0].scene} has {sizes[0][0]} UAVs and {sizes[0][1]} "
@@ -88,7 +89,7 @@ class FederatedSession:
                       round_timeout_s=self.federation.round_timeout_s)
 
     def _show(self, parties: list[Party]) -> None:
-        """Print what each party's policy collects."""
+        """Draw and print the share that each party's policy collects."""
         curves, rows = {}, []
         for party in parties:
             table = pd.read_csv(party.folder / "metrics.csv")
@@ -106,9 +107,9 @@ class FederatedSession:
 
 
 def federate(shared: Shared, clients: list[Client]) -> list[Weights]:
-    """Make the means in this process, and return them.
+    """Run all rounds of a federation in this process; return the mean weights after each.
 
-    Every party trains in every round, so that the mean is that of `FedQMIX`.
+    Every party trains in every round, so the means are those of `FedQMIX`.
     """
     means = [initial_weights(shared)]
     rounds = len(rounds_of(shared.run, shared.learner))
@@ -122,11 +123,12 @@ def federate(shared: Shared, clients: list[Client]) -> list[Weights]:
 
 
 def _listed(text: str) -> list[Path]:
+    """Split a comma-separated text into paths."""
     return [Path(each.strip()) for each in text.split(",") if each.strip()]
 
 
 def node_config(party: Party) -> dict[str, str | int]:
-    """Return a party as `--node-config` of a SuperNode has it."""
+    """Return the `--node-config` of a party's SuperNode."""
     given = {name: value for name, value in asdict(party).items() if value is not None}
     given["out"] = given.pop("folder")
     return {name: str(value.absolute()) if isinstance(value, Path) else value

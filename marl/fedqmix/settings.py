@@ -1,4 +1,4 @@
-"""Settings of a federation, checked when they are given, and the Flower App that carries them."""
+"""Settings of a federation, and the Flower App that carries them."""
 
 import json
 from collections.abc import Mapping
@@ -13,11 +13,11 @@ from radiotwin import __version__
 from radiotwin.errors import BadInput
 from radiotwin.io.files import atomic_file
 
-OWN = ("scene", "truth", "device")  # of `RunSettings`: each party has its own
+OWN = ("scene", "truth", "device")  # fields of `RunSettings` that each party sets for itself
 
 
 class FederationSettings(BaseModel):
-    """Settings of a federation, and data of its parties."""
+    """Settings of a federation, and the files of its parties."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -40,7 +40,7 @@ class FederationSettings(BaseModel):
 
 
 class Shared(BaseModel):
-    """Settings that the coordinator decides."""
+    """Settings common to all parties, set by the coordinator."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -56,13 +56,13 @@ class Shared(BaseModel):
 
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> "Shared":
-        """Return the settings of a Flower run, which come from somebody else.
+        """Validate the configuration of a Flower run, which may come from somebody else.
 
         Args:
             config: `Context.run_config`: keys such as `run.episodes`.
 
         Raises:
-            BadInput: names what is not allowed.
+            BadInput: a key or value that is not allowed.
         """
         nested: dict[str, Any] = {}
         for name, value in config.items():
@@ -76,22 +76,22 @@ class Shared(BaseModel):
             first = error.errors()[0]
             raise BadInput(f"{'.'.join(map(str, first['loc']))} = {str(first['input'])[:60]} in "
                            f"the settings of the federation: {first['msg']}") from None
-        check_together(shared.run, shared.learner)
+        check_together(shared.learner)
         if shared.min_clients > shared.clients:
             raise BadInput(f"--min-clients {shared.min_clients}: there are {shared.clients} "
                            "parties")
         return shared
 
     def config(self) -> dict[str, Any]:
-        """Return the tables of the app's configuration, which `of` reads."""
+        """Return the app's configuration, which `of` reads."""
         return self.model_dump(mode="json", exclude={"run": set(OWN)})
 
 
 def write_app(shared: Shared, parties: list[dict[str, Any]], folder: Path) -> None:
-    """Write a Flower App, a `pyproject.toml` with settings only, and a file of its parties.
+    """Write a Flower App (`pyproject.toml` with settings) and the file of its parties.
 
-    No code is in the app: every party runs what it has installed. The parties' file does not
-    travel; Flower's simulation engine needs it.
+    The app has no code: each party runs its installed package. The file of parties is only for
+    Flower's simulation engine, and is not part of the app.
     """
     app = {"publisher": "radiotwin", "config": shared.config(),
            "components": {"serverapp": "marl.fedqmix.flower_app:server_app",

@@ -443,18 +443,19 @@ def training_parts(links: Links, folds: Folds) -> list[Links]:
 
 
 def cross_validate(links: Links, base: Base, folds: Folds,
-                   parts: list[Links]) -> CrossFit:
+                   parts: list[Links] | None = None) -> CrossFit:
     """Fit a base to all links, and to the links outside each fold.
 
     Args:
         links: n links.
         base: what to fit.
         folds: assignment of the links.
-        parts: `training_parts(links, folds)`.
+        parts: `training_parts(links, folds)`, if bases share them.
 
     Raises:
         BadInput: too few usable links.
     """
+    parts = training_parts(links, folds) if parts is None else parts
     twin = base.fit(links)
     device_m = base.device_m(twin)
     dof = best_dof(links, twin.channel, device_m)

@@ -7,7 +7,7 @@ No code of radiotwin makes their levels: laws, antennas and errors are written o
 import numpy as np
 import pandas as pd
 
-from radiotwin.closeloop.crossfit import cross_validate, make_bases, make_folds, training_parts
+from radiotwin.closeloop.crossfit import cross_validate, make_bases, make_folds
 from radiotwin.links import prepare_links
 from radiotwin.links.measurements import Measurements
 from radiotwin.twin.model.fitting import add_effect
@@ -58,6 +58,6 @@ def fitted(table, effect, seed=0, devices_m=MASTS_M):
     measurements = Measurements(table.drop(columns=["azimuth_deg", "distance_m"]), devices)
     links = prepare_links(measurements, None)
     folds = make_folds(links, seed)
-    before = cross_validate(links, make_bases(None, seed)["log-distance"], folds, training_parts(links, folds))
+    before = cross_validate(links, make_bases(None, seed)["log-distance"], folds)
     whole = add_effect(before.whole, effect)
     return before.with_fits(whole, [add_effect(fold, effect, whole.effects[-1]) or fold for fold in before.folds])

@@ -72,32 +72,17 @@ def scores(rmse_db, n=100):
     return {"rmse_db": rmse_db, "n": n}
 
 
-def test_the_advice_names_the_best_other_model():
-    error = {"combined": scores(3.0), "after": scores(4.0)}
-    found = compare_with_baselines(error, {"log_distance": scores(9.0), "regression_kriging": scores(3.61)})
-    assert found["best_baseline"] == "regression_kriging"
-    assert "17 % better" in found["advice"] and "kriging alone: 3.61 dB" in found["advice"]
-    assert "with all that was found is behind kriging: 4.00 dB" in found["advice"]
-
-
-def test_the_advice_says_where_a_plain_model_would_do():
-    error = {"combined": scores(3.6), "after": scores(3.6)}
-    assert "a plain regression would do: kriging 3.61 dB" in compare_with_baselines(
-        error, {"regression_kriging": scores(3.61)})["advice"]
-
-
-def test_a_published_law_is_no_regression_and_an_error_of_two_in_a_hundred_more_is_none():
-    error = {"combined": scores(5.0), "after": scores(5.1)}
-    advice = compare_with_baselines(error, {"p1411": scores(5.05)})["advice"]
-    assert "a published law would do: p1411 5.05 dB" in advice and "is behind" not in advice
-    assert "is behind p1411: 5.16 dB" in compare_with_baselines(
-        error | {"after": scores(5.16)}, {"p1411": scores(5.05)})["advice"]
-
-
-def test_errors_of_zero_are_compared():
-    error = {"combined": scores(0.0), "after": scores(0.0)}
-    advice = compare_with_baselines(error, {"log_distance": scores(0.0)})["advice"]
-    assert "would do: the log-distance law 0.00 dB" in advice and "is behind" not in advice
+@pytest.mark.parametrize(("combined_db", "after_db", "baselines_db", "said", "is_behind"), [
+    (3.0, 4.0, {"log_distance": 9.0, "regression_kriging": 3.61}, ["17 % better", "kriging alone: 3.61 dB", "kriging: 4.00 dB"], True),
+    (3.6, 3.6, {"regression_kriging": 3.61}, ["a plain regression would do: kriging 3.61 dB"], False),
+    (5.0, 5.1, {"p1411": 5.05}, ["a published law would do: p1411 5.05 dB"], False),  # 2 % more is as good
+    (5.0, 5.16, {"p1411": 5.05}, ["is behind p1411: 5.16 dB"], True),
+    (0.0, 0.0, {"log_distance": 0.0}, ["would do: the log-distance law 0.00 dB"], False)])
+def test_the_advice_compares_the_best_other_model(combined_db, after_db, baselines_db, said, is_behind):
+    error = {"combined": scores(combined_db), "after": scores(after_db)}
+    found = compare_with_baselines(error, {name: scores(rmse_db) for name, rmse_db in baselines_db.items()})
+    assert found["best_baseline"] == min(baselines_db, key=baselines_db.get)
+    assert all(part in found["advice"] for part in said) and ("is behind" in found["advice"]) == is_behind
 
 
 def test_a_model_of_fewer_links_is_not_compared():

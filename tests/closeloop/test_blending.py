@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from radiotwin.closeloop.crossfit import cross_validate, make_bases, make_folds, training_parts
+from radiotwin.closeloop.crossfit import cross_validate, make_bases, make_folds
 from radiotwin.closeloop.predict import baselines, predictor
 from radiotwin.closeloop.predict.baselines import Part, fitted_law, grow_trees, held_out_baselines
 from radiotwin.closeloop.predict.predictor import combined_fit, combined_prediction
@@ -50,7 +50,7 @@ def links_of(devices_move=False):
 
 def folded(links):
     folds = make_folds(links, 0, "auto")
-    model = cross_validate(links, make_bases(None, 0)["log-distance"], folds, training_parts(links, folds))
+    model = cross_validate(links, make_bases(None, 0)["log-distance"], folds)
     offset = ReceiverGainOffset().with_params(ReceiverGainOffset.Params(members=[0, 1], offsets_sd_db=2.0))
     return model.map(lambda fit: fit.with_effects([offset]))
 

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 import radiotwin as rt
-from radiotwin.closeloop.crossfit import cross_validate, make_bases, make_folds, training_parts
+from radiotwin.closeloop.crossfit import cross_validate, make_bases, make_folds
 from radiotwin.closeloop.output.corrected_twin import corrected_twin
 from radiotwin.closeloop.predict.baselines import EXTRA_TREES, grow_trees
 from radiotwin.closeloop.search.declared import add_declared
@@ -66,7 +66,7 @@ def taken(measurements):
     links = prepare_links(measurements, None)
     folds = make_folds(links, 0, "device")
     kind = make_bases(None, 0)["log-distance"]
-    base = cross_validate(links, kind, folds, training_parts(links, folds))
+    base = cross_validate(links, kind, folds)
     result = search(SearchState(base), [add_declared], SearchInputs(links, kind, folds, tuple(effect() for effect in BUILT_IN)))
     whole, parameters = result.model.whole, {}
     for each, estimate in zip(whole.effects, estimates(linearise(whole)), strict=True):
@@ -108,7 +108,7 @@ def test_one_wrong_azimuth_is_named_among_right_ones(wrong, by_deg):
     devices = measurements.devices.assign(azimuth_deg=azimuth_deg % 360)
     links = prepare_links(replace(measurements, devices=devices), None)
     kind, folds = make_bases(None, 0)["log-distance"], make_folds(links, 0, "block")
-    view = cross_validate(links, kind, folds, training_parts(links, folds)).whole.view
+    view = cross_validate(links, kind, folds).whole.view
     (params,) = DeclaredSectors().propose(view)
     assert list(params.own_turns_deg) == ([] if wrong is None else [wrong])
     for turn_deg, sd_deg in params.own_turns_deg.values():
@@ -251,7 +251,7 @@ def test_of_two_forms_held_out_links_choose(forms):
     links = prepare_links(network(5), None)
     folds = make_folds(links, 0, "device")
     kind = make_bases(None, 0)["log-distance"]
-    model = cross_validate(links, kind, folds, training_parts(links, folds))
+    model = cross_validate(links, kind, folds)
     result = search(SearchState(model), [add_declared], SearchInputs(links, kind, folds, tuple(form() for form in forms)))
     [effect] = result.model.whole.effects
     assert effect.variant == "all of it"
@@ -273,28 +273,6 @@ def test_trees_of_a_stored_blend_know_the_azimuths_and_nobody_need_tell_them_aga
     np.testing.assert_allclose(again.apply(later, zero, one, 5.0, (zero, one))[0], expected_db, atol=1e-5)
     with pytest.raises(ValueError, match="belongs to no device"):
         Blend.from_state(arrays | {"boresights_deg": azimuths + [6, 0]}, settings, 6)
-
-
-def test_a_held_out_sector_is_predicted_as_the_twin_that_lacks_it_predicts_it():
-    """The rest counts in units of what heard sectors scatter by, however uncertain the level of an unheard one is."""
-    links = prepare_links(network(8), None)
-    folds = make_folds(links, 0, "device")
-    kind = make_bases(None, 0)["log-distance"]
-    base = cross_validate(links, kind, folds, training_parts(links, folds))
-    result = search(SearchState(base), [add_declared], SearchInputs(links, kind, folds, tuple(effect() for effect in BUILT_IN)))
-    fields = [each.rest(0) for each in result.model.fits]
-    model = result.model.map(lambda fit, own: replace(fit, shadowing=own), fields)
-    mean_db, scale_db = model.held_out_reading
-    spread_db, unheard_db = model.held_out_scales
-    assert np.median(unheard_db) > 3.0 and np.median(spread_db) < 4.0
-    for number, (fold, field) in enumerate(zip(model.folds, fields[1:])):
-        own = model.index == number
-        assert fold.links.device[own].min() == fold.links.device[own].max()
-        twin = replace(fold.learnt, shadowing=field).predict(links.select(own))
-        np.testing.assert_allclose(mean_db[own], twin.mean_db, atol=1e-6)
-        t_sd = np.sqrt(model.whole.model.dof / (model.whole.model.dof - 2))
-        np.testing.assert_allclose(twin.sd_db, t_sd * scale_db[own], rtol=1e-6)
-        assert (scale_db[own] > unheard_db[own]).all()
 
 
 @pytest.mark.parametrize("groups", [[[0]] * 5000, [[0, 0]], [[0, 9]], [[0, 1]] * 3])

@@ -13,7 +13,6 @@ from radiotwin.closeloop.crossfit import (
     make_bases,
     make_folds,
     match_effects,
-    training_parts,
 )
 from radiotwin.closeloop.search.faults import _without, drop_idle_faults
 from radiotwin.closeloop.search.stages import SearchInputs, SearchState
@@ -146,7 +145,7 @@ def test_a_step_that_other_effects_explain_is_taken_back(step_db):
     links = prepare_links(campaign(4, loss_db=0.0, step_db=step_db), None)
     folds = make_folds(links, 0, "flight")
     base = make_bases(None, 0)["log-distance"]
-    model = cross_validate(links, base, folds, training_parts(links, folds))
+    model = cross_validate(links, base, folds)
     step = ReceiverDrift(True).with_params(ReceiverDrift.Params(receivers={0: Drift("step", 600.0)}))
     found = SearchState(model).keep(Trial("receiver_drift"), model.map(lambda fit: fit.with_effects([step])))
     result = drop_idle_faults(found, SearchInputs(links, base, folds, ()))
@@ -165,7 +164,7 @@ def test_a_fault_that_its_own_search_would_not_find_beside_the_others_is_taken_b
     links = prepare_links(measurements, None)
     folds = make_folds(links, 0, "flight")
     base = make_bases(None, 0)["log-distance"]
-    model = cross_validate(links, base, folds, training_parts(links, folds))
+    model = cross_validate(links, base, folds)
     params = Episode.Params(receiver=0, flight=None, start_s=BEGIN_S, end_s=END_S, start_within_s=(BEGIN_S - 1, BEGIN_S),
                             end_within_s=(END_S, END_S + 1), form="loss", frequency_hz=2.4e9)
     episode = Episode().with_params(params)

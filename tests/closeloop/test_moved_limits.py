@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from radiotwin.closeloop.crossfit import LogDistanceBase, cross_validate, make_folds, training_parts
+from radiotwin.closeloop.crossfit import LogDistanceBase, cross_validate, make_folds
 from radiotwin.closeloop.search.causes import add_causes
 from radiotwin.closeloop.search.stages import SearchInputs, SearchState, search
 from radiotwin.effects.catalogue.detection_limit import DetectionLimit
@@ -27,7 +27,7 @@ def test_one_fault_has_one_name(open_ground, off_db, limit_moves, named):
     links = limits_to_explain(prepare_links(open_ground.measured(world), None))
     folds = make_folds(links, 0)
     base = LogDistanceBase(None, 0)
-    model = cross_validate(links, base, folds, training_parts(links, folds))
+    model = cross_validate(links, base, folds)
     result = search(SearchState(model), [add_causes], SearchInputs(links, base, folds, (ReceiverGainOffset(), DetectionLimit())))
     assert [each.name for each in result.model.whole.effects] == named
     used_db = [float(np.median(result.model.whole.model.limit_db[links.receiver == receiver])) for receiver in (0, 1)]

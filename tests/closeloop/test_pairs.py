@@ -2,7 +2,7 @@
 
 import pytest
 
-from radiotwin.closeloop.crossfit import LogDistanceBase, cross_validate, make_folds, training_parts
+from radiotwin.closeloop.crossfit import LogDistanceBase, cross_validate, make_folds
 from radiotwin.closeloop.search.causes import add_causes
 from radiotwin.closeloop.search.stages import SearchInputs, SearchState, search
 from radiotwin.closeloop.verdict.criteria import SelectionCriteria
@@ -21,7 +21,7 @@ def selected(open_ground):
         links = prepare_links(open_ground.measured(world), None)
         folds = make_folds(links, 0)
         base = LogDistanceBase(None, 0)
-        model = cross_validate(links, base, folds, training_parts(links, folds))
+        model = cross_validate(links, base, folds)
         return search(SearchState(model), [add_causes], SearchInputs(links, base, folds, (DevicePositionError(), ReceiverGainOffset()),
                                                         SelectionCriteria(min_probability=min_probability)))
     return run

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from radiotwin.closeloop import crossfit as cross_validation
-from radiotwin.closeloop.crossfit import cross_validate, make_bases, make_folds, training_parts
+from radiotwin.closeloop.crossfit import cross_validate, make_bases, make_folds
 from radiotwin.closeloop.predict import predictor
 from radiotwin.closeloop.predict.predictor import combined_prediction
 from radiotwin.closeloop.predict.weights import Combination
@@ -31,7 +31,7 @@ def flown(open_ground, seed, part=6, **options):
 def predicted(links, with_rest=False):
     """Return folds and the combination upon the log-distance law, without any effect."""
     folds = make_folds(links, 0)
-    model = cross_validate(links, make_bases(None, 0)["log-distance"], folds, training_parts(links, folds))
+    model = cross_validate(links, make_bases(None, 0)["log-distance"], folds)
     return model, combined_prediction(model, with_rest, 0)
 
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from radiotwin.closeloop.crossfit import cross_validate, make_bases, make_folds, training_parts
+from radiotwin.closeloop.crossfit import cross_validate, make_bases, make_folds
 from radiotwin.closeloop.scan import scan
 from radiotwin.links import prepare_links
 from radiotwin.links.measurements import Measurements
@@ -28,7 +28,7 @@ def judged(seed):
     if len(made.boxes):
         links = replace(links, world=replace(links.world, city=CityMap(*solids(made.boxes))))
     folds = make_folds(links, 0)
-    model = cross_validate(links, make_bases(None, 0)["twin"], folds, training_parts(links, folds))
+    model = cross_validate(links, make_bases(None, 0)["twin"], folds)
     hidden = [{"name": made.fault, **{end: its for end, (its,) in made.ends.items()},
                **{axis: each for place in made.place_m for axis, each in zip(("x_m", "y_m"), (place[:2], place[2:]))}}]
     row = compare(model, scan(model), measurements, hidden * bool(made.fault), [made.change_db] * bool(made.fault), made.los)

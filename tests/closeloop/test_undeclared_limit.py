@@ -5,7 +5,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from radiotwin.closeloop.crossfit import LogDistanceBase, cross_validate, make_folds, training_parts
+from radiotwin.closeloop.crossfit import LogDistanceBase, cross_validate, make_folds
 from radiotwin.closeloop.output.result_file import errors
 from radiotwin.links import prepare_links
 from radiotwin.links.limits import limits_to_explain
@@ -37,7 +37,7 @@ def held_out(links):
     """Return errors of links in blocks that the law was not fitted to."""
     links = limits_to_explain(links)
     folds = make_folds(links, 0, "block")
-    model = cross_validate(links, LogDistanceBase(None, 0), folds, training_parts(links, folds))
+    model = cross_validate(links, LogDistanceBase(None, 0), folds)
     return errors(links.level_db, model.held_out_mean_db)
 
 

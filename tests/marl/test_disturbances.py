@@ -1,13 +1,10 @@
 """Flights with a disturbance."""
 
 import numpy as np
-import torch
 
-from marl.environment import Environment, observation_size
+from marl.environment import Environment
 from marl.flights import fly
 from marl.heuristics import HeuristicPolicy
-from marl.mission import HOVER, NO_OP
-from marl.qmix import Agent, AgentPolicy
 from studies.disturbed import Disturbance, DisturbedEnvironment
 
 
@@ -52,15 +49,3 @@ def test_a_failed_uav_stays_where_it_is_and_collects_no_more(tiny):
 def test_a_battery_of_one_hover_can_fail_too(tiny):
     flights = flown(tiny(0, uavs=1, battery=(1,)), Disturbance(loss=1.0), 20)
     assert (flights.length == 1).all()
-
-
-def test_a_failed_uav_does_not_follow_the_guide(tiny):
-    mission = tiny(0, uavs=2, battery=(40, 40))
-    agent = Agent(observation_size(mission), mission.uavs, 8, torch.Generator().manual_seed(0))
-    plan = np.full((mission.longest, 2), HOVER)
-    policy = AgentPolicy(agent, guide=(plan, np.full(50, mission.longest)))
-    flights = fly(DisturbedEnvironment(mission, 50, np.random.default_rng(0), Disturbance(loss=1.0)), policy)
-    down = flights.frames.battery == 0
-    flown = np.arange(mission.longest)[None, :] < flights.length[:, None]
-    assert down[flown].any() and (flights.action[flown][down[flown]] == NO_OP).all()
-    assert (flights.action[flown][~down[flown]] == HOVER).all()

@@ -135,7 +135,6 @@ def flat(value):
     ("--algorithm magic", ["--algorithm magic", "fedqmix|qmix|iql|greedy|heuristic|policy|planner|belief|random"]),
     ("--fly-again true", ["No such option: --fly-again"]),
     ("--batch 64 --replay 32", ["replay 32", "64"]),
-    ("--guide planner --algorithm greedy", ["guide planner", "greedy does not learn"]),
     pytest.param("--device cuda", ["--device cuda: ", "radiotwin doctor"], marks=pytest.mark.skipif(
         cuda.torch_refusal() is None, reason="there is a GPU")),
     ("--device tpu", ["--device tpu", "auto|cpu|cuda"]),

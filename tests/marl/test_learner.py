@@ -18,7 +18,6 @@ from marl.settings import (
     LEARNERS,
     LearnerSettings,
     RunSettings,
-    check_together,
     learner_class,
     learners,
     settings_of,
@@ -107,12 +106,6 @@ def test_a_new_learner_resumes(small_scene, tmp_path, best_of_many):
         execute(tmp_path, False, stop)
     resumed = execute(tmp_path, True, lambda *_: None)
     np.testing.assert_array_equal(resumed.flights.action, unbroken.flights.action)
-
-
-def test_only_what_learns_can_be_guided(best_of_many):
-    check_together(RunSettings(algorithm="best-of-many", guide="planner"), LearnerSettings())
-    with pytest.raises(BadInput, match="fedqmix, qmix, iql, best-of-many only"):
-        check_together(RunSettings(algorithm="random", guide="planner"), LearnerSettings())
 
 
 def test_an_unknown_learner_is_refused_as_every_other_choice():

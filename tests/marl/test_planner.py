@@ -22,7 +22,7 @@ from marl.planner import (
     plan,
     take_off,
 )
-from studies.exact import most_data, small_mission
+from tests.marl.exhaustive import most_data, small_mission
 
 
 def flown(mission, actions, flights=1, seed=0):

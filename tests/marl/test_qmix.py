@@ -13,7 +13,6 @@ from marl.environment import Environment, Frame
 from marl.flights import Flights, fly
 from marl.heuristics import HeuristicPolicy
 from marl.learner import make_learner
-from marl.planner import Plan
 from marl.qmix import Agent, IndependentNetworks, Mixer, QNetworks, td_lambda_targets
 from marl.settings import PRESETS, LearnerSettings, RunSettings
 
@@ -263,15 +262,3 @@ def test_without_selection_flights_the_last_policy_flies(tiny, monkeypatch):
     agent = torch.cat([torch.from_numpy(mean[f"agent.{name}"]).ravel() for name, _ in
                        learner._best.named_parameters()])
     assert torch.equal(best(learner), agent)
-
-
-@pytest.mark.parametrize("shares, kept", [((0.50, 0.51), 0), ((0.50, 0.53), 1)])
-def test_a_teacher_changes_its_plan_only_for_one_that_is_clearly_better(tiny, monkeypatch, shares, kept):
-    mission = tiny(0)
-    plans = [np.full((mission.longest, mission.uavs), number, np.int8) for number in (0, 5)]
-    learner = make_learner(RUN.model_copy(update={"guide": "planner"}), LEARNER, mission, 2)
-    new, seen = iter(plans), iter(shares)
-    monkeypatch.setattr(marl.qmix, "plan", lambda *_: Plan(next(new), 0.0, None, None))
-    monkeypatch.setattr(marl.qmix, "evaluate", lambda *_: Seen(next(seen)))
-    learner._actions = learner._better_plan(mission)
-    np.testing.assert_array_equal(learner._better_plan(mission), plans[kept])

@@ -9,7 +9,7 @@ import torch
 from marl.environment import Environment, observation_size, observe
 from marl.flights import fly
 from marl.heuristics import HeuristicPolicy
-from marl.mission import HOVER, Mission
+from marl.mission import Mission
 from marl.qmix import Agent, AgentPolicy, IndependentNetworks, QNetworks, Trainer
 from marl.settings import LearnerSettings
 from marl.training import Exploration, Replay
@@ -50,23 +50,6 @@ def test_the_same_seed_learns_the_same_weights_and_another_replica_others(tiny, 
     one, same, other = (list(trainer.networks.parameters()) for trainer in trainers)
     assert all(torch.equal(a, b) for a, b in zip(one, same))
     assert any(not torch.equal(a, b) for a, b in zip(one, other))
-
-
-def test_a_quarter_of_the_flights_follow_a_plan_and_the_help_for_the_others_fades(tiny):
-    mission, plan = tiny(0), np.full((20, 2), HOVER)
-    trainer = Trainer(QNetworks, SETTINGS, mission, 40, 0)
-    trainer.enter(mission, plan)
-    slots = np.array([trainer._followed_slots(10) for _ in range(200)])
-    assert (slots[:, :3] == 20).all()
-    assert slots[:, 3:].min() == 0 and slots[:, 3:].max() == 20 and abs(slots[:, 3:].mean() - 10) < 1
-    trainer.episodes = 30
-    assert np.array([trainer._followed_slots(10)[3:] for _ in range(200)]).max() == 5
-    trainer.episodes = 40
-    assert trainer._followed_slots(10)[3:].max() == 0
-    one_by_one = []
-    for trainer.episodes in range(40, 80):  # when nothing else is guided any more
-        one_by_one += trainer._followed_slots(1).tolist()
-    assert one_by_one == [20, 0, 0, 0] * 10
 
 
 def test_a_trainer_goes_on_from_its_state_to_the_bit(tiny):
@@ -139,16 +122,6 @@ def test_exploration_is_as_frequent_as_epsilon_says_and_safe(city_mission, agent
     fly(environment, AgentPolicy(agent, exploration=Exploration(1.0, mean_slots, rng)))
     home = city_mission.steps_home[np.arange(2), environment.frame.cell[..., 0], environment.frame.cell[..., 1]]
     assert (home == 0).all()
-
-
-def test_a_guided_flight_follows_the_plan_for_its_number_of_slots(city_mission, agent):
-    rng = np.random.default_rng(0)
-    plan = fly(Environment(city_mission, 1, rng), HeuristicPolicy("greedy", rng)).action[0]
-    slots = np.array([0, 7, len(plan)])
-    flights = fly(Environment(city_mission, 3, rng), AgentPolicy(agent, guide=(plan, slots)))
-    np.testing.assert_array_equal(flights.action[1, :7], plan[:7])
-    np.testing.assert_array_equal(flights.action[2, :flights.length[2]], plan[:flights.length[2]])
-    assert not np.array_equal(flights.action[0, :7], plan[:7])
 
 
 def explored(exploration, slots, flights=2000, feasible=lambda slot: [0, 1, 2, 3, 4]):

@@ -93,7 +93,7 @@ def test_every_method_flies_where_things_are_not_as_thought(small_scene):
     settings = {name.replace("rbm", "small"): {key: quick.get(key, value) for key, value in each.items()}
                 for name, each in disturbances.pays_cases(0).items() if name.startswith("rbm-everything")}
     rows = rows_of(disturbances.fly_disturbed, small_scene, settings)
-    assert len(rows) == 8 and all(len(ratios) == 6 for ratios in rows["ratios"])
+    assert len(rows) == 6 and all(len(ratios) == 6 for ratios in rows["ratios"])
     by_name = rows.set_index("name")
     assert by_name["curve"]["small-everything-policy"]["episodes"] == [40]
     table = disturbances.pays_table(rows)
@@ -172,14 +172,6 @@ def test_the_oracle_has_the_true_city(family):
                      np.mean(effect["corners_m"], axis=0))[None]
     heights_m = [float(scene.city.height_at(*where.T)[0]) for scene in (hidden.scene, true)]
     assert (heights_m[1] > heights_m[0] + 20) if family == "missing_obstacle" else (heights_m[1] < heights_m[0] - 3)
-
-
-def test_levels_that_are_drawn_from_a_base_have_its_links():
-    drawn = closeloop.draw_from_base(0, "twin", 0)
-    measurements = case("nothing", 0).measurements
-    level_db = drawn.level_db[np.isfinite(drawn.level_db)]
-    assert 0.8 * len(measurements.table) < len(drawn.table) <= len(measurements.table)
-    assert np.all(level_db % closeloop.STEP_DB == 0)
 
 
 def test_permuted_levels_stay_with_their_device():

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from radiotwin.closeloop.crossfit import cross_validate, make_bases, make_folds, training_parts
+from radiotwin.closeloop.crossfit import cross_validate, make_bases, make_folds
 from radiotwin.coverage import CoverageSettings, predict_coverage, read_transmitters
 from radiotwin.coverage.sources import source_of_twin
 from radiotwin.coverage.transmitters import Transmitter
@@ -357,7 +357,7 @@ def test_held_out_errors_of_a_close_loop_are_those_of_the_gains(ground, tmp_path
     for each in (data, Measurements(gains, data.devices.drop(columns="tx_power_dbm"))):
         links = prepare_links(each, ground)
         folds = make_folds(links, 0, "block")
-        model = cross_validate(links, make_bases(ground, 0)["log-distance"], folds, training_parts(links, folds))
+        model = cross_validate(links, make_bases(ground, 0)["log-distance"], folds)
         errors_db.append(links.level_db - model.held_out_mean_db)
     np.testing.assert_allclose(*errors_db, atol=1e-4)
     assert np.nanstd(errors_db[0]) == pytest.approx(SD_DB, abs=0.15)

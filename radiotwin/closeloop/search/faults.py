@@ -23,7 +23,6 @@ from radiotwin.closeloop.crossfit import (
     cross_validate,
     make_folds,
     match_effects,
-    training_parts,
 )
 from radiotwin.closeloop.search.scoring import (
     Candidate,
@@ -214,7 +213,7 @@ def within_flights(model: CrossFit, inputs: SearchInputs, by: str = "") -> Cross
     by_device = len(links.anchors & set(links.device.tolist())) >= MIN_HELD_OUT_DEVICES
     by = by or ("device" if by_device and not devices_move(links) else "block")
     folds = make_folds(links, inputs.seed, by)
-    other = cross_validate(links, inputs.base, folds, training_parts(links, folds))
+    other = cross_validate(links, inputs.base, folds)
     for effect in model.whole.effects:  # one by one, so that each fit starts from the one before
         other = other.map(lambda fit, effect=effect: fit.with_effects([*fit.effects, effect]))
     return other

@@ -1,24 +1,16 @@
-"""How near is the planner to the best? All flights of two UAVs on small missions are tried.
+"""The best plan of small missions, by trying all flights of two UAVs.
 
-    python -m studies.exact docs/results/exact.json
-
-They are valued by the mission's rules, written here a second time.
+Flights are valued by the mission's rules, written here a second time.
 """
-
-import json
-import sys
-import time
-from pathlib import Path
 
 import numpy as np
 
 from marl.mission import COSTS, MOVES, NO_OP, Mission
-from marl.planner import expected_data, plan
+from marl.planner import expected_data
 from radiotwin.maps.survey import LOS_LAW
 from radiotwin.runtime.compiled import njit
 
 SIDE, STEP_M = 5, 100.0
-MISSIONS, ITERATIONS = 20, 20_000
 
 
 def small_mission(seed: int) -> Mission:
@@ -113,21 +105,3 @@ def _most(one: np.ndarray, other: np.ndarray, data_units: np.ndarray) -> float:
                     left[k_second] = max(left[k_second] - second, 0.0)
             best = max(best, data_units.sum() - left.sum())
     return best
-
-
-def main(out: Path) -> None:
-    """Write optimum and plan of each mission."""
-    results = []
-    for seed in range(MISSIONS):
-        mission, before = small_mission(seed), time.process_time()
-        optimum = most_data(mission)
-        results.append({"seed": seed, "optimum": round(optimum, 4),
-                        "planner": round(plan(mission, ITERATIONS, 0).ratio, 4),
-                        "cpu_s": round(time.process_time() - before, 1)})
-        print(results[-1], flush=True)
-    out.write_text(json.dumps({"study": "exact", "iterations": ITERATIONS, "missions": results},
-                              indent=1) + "\n", encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main(Path(sys.argv[1]))
