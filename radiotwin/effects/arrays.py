@@ -32,7 +32,7 @@ class LinkCache:
         return type(self), ()
 
     def state(self) -> None:
-        """Decide nothing: what is remembered could be derived again."""
+        """Return nothing for the key of cached results: the values can be derived again."""
 
 
 def city_of(links: Links, effect: str) -> CityMap:

@@ -31,9 +31,9 @@ class MovedEnd(GainEffect):
         rows = np.isin(np.arange(len(view.links)), self.rows(view.links))
         return self.propose(view.of_group(rows)) if rows.sum() >= MIN_LINKS else []
 
-    @abstractmethod
     def rows(self, links: Links) -> np.ndarray:
-        """Return the rows (r,) of the moved end's links."""
+        """Return the rows (r,) of the moved end's links; by default of a receiver."""
+        return np.flatnonzero(links.receiver == self.params.receiver)
 
     @abstractmethod
     def moved(self, links: Links) -> Links:

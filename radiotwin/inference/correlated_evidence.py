@@ -186,16 +186,10 @@ class CorrelatedEvidence:
 
     def information(self, pattern: np.ndarray, columns: np.ndarray, prior_sd: np.ndarray,
                     theta: np.ndarray) -> float:
-        """Compute the Fisher information about the size of a pattern [1/size²].
+        """Compute the Fisher information about the size of a rotated pattern (m,) [1/size²].
 
         Twice the expected log-likelihood ratio of the pattern at size 1, with the columns fitted as
-        well.
-
-        Args:
-            pattern: (m,) rotated pattern of unit size.
-            columns: (m, q) rotated columns.
-            prior_sd: (q,) prior standard deviations of their coefficients.
-            theta: (2,) logarithms of the variances.
+        well. Other arguments as in `at`.
         """
         variance = np.exp(theta[0]) * (1.0 + np.exp(theta[1]) * self.spectrum)
         weighted = columns.T / variance

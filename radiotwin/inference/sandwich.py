@@ -64,7 +64,7 @@ class Scores:
             count = cluster.max() + 1
             if count < 2:
                 continue
-            clustered = self._clustered(bread, cluster, count)
+            clustered = self._clustered(bread, information, cluster, count)
             clustered += bread @ np.diag(self.prior_score_variance) @ bread
             effective = self._effective_clusters(bread, cluster, count)
             widening = t.ppf(QUANTILE, np.maximum(effective - 1, 1.0)) / norm.ppf(QUANTILE)
@@ -74,7 +74,8 @@ class Scores:
             found.append(clustered * np.outer(sd / clustered_sd, sd / clustered_sd))
         return found
 
-    def _clustered(self, bread: np.ndarray, cluster: np.ndarray, count: int) -> np.ndarray:
+    def _clustered(self, bread: np.ndarray, information: np.ndarray, cluster: np.ndarray,
+                   count: int) -> np.ndarray:
         """Compute the covariance (q, q) for clusters (n,) with independent errors.
 
         Few clusters pull the fit towards themselves: then by the jackknife. A cluster without which
@@ -83,7 +84,7 @@ class Scores:
         sums = _sum_by_cluster(self.score, cluster, count)
         if count > MAX_LEFT_OUT:
             return count / (count - 1) * bread @ (sums.T @ sums) @ bread
-        information = _dense(self.root.T @ self.root) + np.diag(self.precision + 1e-12)
+        information = information + np.diag(self.precision + 1e-12)
         rows = np.tile(cluster, self.root.shape[0] // len(cluster))
         moves = np.empty_like(sums)
         for number in range(count):

@@ -70,9 +70,6 @@ class ReceiverClockOffset(MovedEnd):
             for receiver, speed_m_s in sorted(_speeds_m_s(view.links).items())
             if receiver not in known))
 
-    @override
-    def rows(self, links: Links) -> np.ndarray:
-        return np.flatnonzero(links.receiver == self.params.receiver)
 
     @override
     def moved(self, links: Links) -> Links:

@@ -305,13 +305,7 @@ def _turned(links: Links, devices: list[int], shape: SectorPattern, offset_deg: 
             own_turns: dict[int, OwnTurn]) -> dict[int, SectorPattern]:
     """Turn a pattern to the declared azimuth and tilt of each device, plus azimuth errors.
 
-    Args:
-        links: links with the declared directions.
-        devices: devices of declared azimuth.
-        shape: pattern; its tilt is added to the declared ones, of which the median (or 0) replaces
-            missing ones.
-        offset_deg: common error of the azimuths.
-        own_turns: errors of single azimuths.
+    The tilt of `shape` is added to the declared ones; the median, or 0, replaces missing ones.
     """
     known = links.tilt_deg[devices]
     usual = float(np.median(known[np.isfinite(known)])) if np.isfinite(known).any() else 0.0
@@ -386,11 +380,9 @@ class _Readings(NamedTuple):
 
     def _mixture(self, width_deg: float, back_db: float
                  ) -> tuple[float, float, dict[int, np.ndarray], SectorPattern]:
-        """Fit the mixture with one flat pattern.
+        """Fit the mixture with one flat pattern: log-likelihood [nats], common error [deg].
 
-        Returns:
-            log-likelihood at the best common error [nats], that error [deg], device -> gain of each
-            trial error (t,) [nats], and the pattern.
+        And device -> gain of each trial error (t,) [nats], and the pattern.
         """
         shape = SectorPattern(beamwidth_deg=width_deg, front_to_back_db=back_db)
         declared = _turned(self.view.links, self.devices, shape, 0.0, {})

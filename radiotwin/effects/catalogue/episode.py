@@ -225,15 +225,10 @@ def _timed_rows(links: Links, receiver: int | None, flight: str | None) -> np.nd
 
 def _strongest(links: Links, values_db: np.ndarray, weights: np.ndarray,
                rows: np.ndarray) -> _Window | None:
-    """Find the window with the highest gain by a loss or an attenuation, among rows (r,).
+    """Find the window in which a loss or an attenuation has the highest gain, among rows (r,).
 
-    Two passes: coarse times over all of the data, then all times near the ends that were found.
-
-    Args:
-        links: n links.
-        values_db: (n,) compared residuals [dB].
-        weights: (n,) their weights [1/dB²].
-        rows: (r,) rows with a time.
+    From compared residuals (n,) and weights (n,). Two passes: coarse times over all of the data,
+    then all times near the ends that were found.
     """
     time_s, rest_db, weight = links.time_s[rows], values_db[rows], weights[rows]
     distance_km = links.distance_m[rows] / 1000
@@ -309,7 +304,10 @@ def _most_members_agree(links: Links, value_db: np.ndarray, weight: np.ndarray, 
         sites = {min(site_of(links, device)) for device in devices}
         pieces = np.unique(np.column_stack([links.device, evidence_blocks(links)])[during], axis=0)
         places = np.median(np.unique(pieces[:, 0], return_counts=True)[1])
-        if len(sites) < MIN_SITES or (places < MIN_PLACES and _is_low(links, during)):
+        place_m = links.receiver_m[during]
+        ground_m = 0.0 if links.city is None else links.city.ground_height_m(*place_m[:, :2].T)
+        is_low = np.median(place_m[:, 2] - ground_m) < LOW_M
+        if len(sites) < MIN_SITES or (places < MIN_PLACES and is_low):
             return False
     outside_db = mean_by_precision(value_db[others], weight[others])
     change_db = mean_by_precision(value_db[during], weight[during]) - outside_db
@@ -320,12 +318,6 @@ def _most_members_agree(links: Links, value_db: np.ndarray, weight: np.ndarray, 
                for label in (links.device, links.receiver)
                if np.bincount(label[during]).max() >= MIN_MEMBER_LINKS)
 
-
-def _is_low(links: Links, rows: np.ndarray) -> bool:
-    """Check whether the median height of receivers above the ground is below `LOW_M`."""
-    place_m = links.receiver_m[rows]
-    ground_m = 0.0 if links.city is None else links.city.ground_height_m(*place_m[:, :2].T)
-    return bool(np.median(place_m[:, 2] - ground_m) < LOW_M)
 
 
 def _is_step_or_flight(links: Links, params: Any, inside: np.ndarray) -> bool:

@@ -265,9 +265,7 @@ def _blank_share(view: ResidualView, rows: np.ndarray) -> float | None:
 def _likeliest(below: np.ndarray, blank: np.ndarray) -> tuple[float, np.ndarray]:
     """Estimate the probability of a random blank, and the gain (n,) of each link by it [nats].
 
-    Args:
-        below: (n,) probability that the level is below the limit.
-        blank: (n,) bool.
+    `below` (n,) is the probability that the level is below the limit.
     """
     below = np.maximum(below, MIN_PROBABILITY)
 

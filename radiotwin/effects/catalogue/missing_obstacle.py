@@ -323,15 +323,9 @@ def _shadow_options(links: Links, options: tuple[T, ...]) -> tuple[T, ...]:
 
 def _gain_db(crossing: Crossing, scattered: np.ndarray | float,
              wavelength_m: float) -> np.ndarray:
-    """Compute the gain of links that cross a box [dB].
+    """Compute the gain of n links that cross a box, from 0 down to -`MAX_LOSS_DB` [dB].
 
-    Args:
-        crossing: of n links.
-        scattered: power in the shadow, relative to the link without the box; scalar, (n,), (k, n).
-        wavelength_m: wavelength [m].
-
-    Returns:
-        (n,) or (k, n), at most 0 and at least -`MAX_LOSS_DB`.
+    `scattered` is the power in the shadow relative to the link without the box, (n,) or (k, n).
     """
     over_db = two_edges_db(crossing.enter_over_m, crossing.leave_over_m, crossing.before_m,
                            crossing.between_m, crossing.behind_m, wavelength_m)

@@ -293,9 +293,6 @@ class ReceiverPositionError(_PositionError):
             [self.Params(receiver=receiver, move_m=tuple(move_m.tolist())) for move_m in moves]
             for receiver in receivers))
 
-    @override
-    def rows(self, links: Links) -> np.ndarray:
-        return np.flatnonzero(links.receiver == self.params.receiver)
 
     @override
     def moved(self, links: Links) -> Links:
