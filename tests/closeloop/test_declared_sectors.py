@@ -275,6 +275,29 @@ def test_trees_of_a_stored_blend_know_the_azimuths_and_nobody_need_tell_them_aga
         Blend.from_state(arrays | {"boresights_deg": azimuths + [6, 0]}, settings, 6)
 
 
+@pytest.mark.slow
+def test_a_held_out_sector_is_predicted_as_the_twin_that_lacks_it_predicts_it():
+    """Shadowing is scaled by the spread of heard sectors, however uncertain the level of an unheard one is."""
+    links = prepare_links(network(8), None)
+    folds = make_folds(links, 0, "device")
+    kind = make_bases(None, 0)["log-distance"]
+    inputs = SearchInputs(links, kind, folds, tuple(effect() for effect in BUILT_IN))
+    result = search(SearchState(cross_validate(links, kind, folds)), [add_declared], inputs)
+    shadowing = [fit.rest(0) for fit in result.model.fits]
+    model = result.model.map(lambda fit, field: replace(fit, shadowing=field), shadowing)
+    mean_db, scale_db = model.held_out_reading
+    spread_db, unheard_db = model.held_out_scales
+    assert np.median(unheard_db) > 3.0 and np.median(spread_db) < 4.0
+    t_sd = np.sqrt(model.whole.model.dof / (model.whole.model.dof - 2))
+    for number, (fold, field) in enumerate(zip(model.folds, shadowing[1:])):
+        held_out = model.index == number
+        assert len(np.unique(fold.links.device[held_out])) == 1
+        twin = replace(fold.learnt, shadowing=field).predict(links.select(held_out))
+        np.testing.assert_allclose(mean_db[held_out], twin.mean_db, atol=1e-6)
+        np.testing.assert_allclose(twin.sd_db, t_sd * scale_db[held_out], rtol=1e-6)
+        assert (scale_db[held_out] > unheard_db[held_out]).all()
+
+
 @pytest.mark.parametrize("groups", [[[0]] * 5000, [[0, 0]], [[0, 9]], [[0, 1]] * 3])
 def test_groups_of_levels_in_a_file_are_those_of_its_devices(groups):
     shape = SectorPattern()
