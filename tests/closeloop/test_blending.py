@@ -23,7 +23,7 @@ from radiotwin.twin.twin import Twin
 from tests.worlds import fly, measured
 
 SHARES = Combination({"named": (0.1, 0.6), FORESTS[0]: (0.4, 0.0), FORESTS[1]: (0.2, 0.0), "named_and_rest": (0.1, 0.1),
-                      "regression_kriging": (0.2, 0.3)}, 40.0, (0.5, 1.2))
+                      "kriging": (0.2, 0.3)}, 40.0, (0.5, 1.2))
 
 
 def links_of(devices_move=False):
@@ -100,7 +100,7 @@ def test_a_baseline_is_what_a_twin_of_that_channel_predicts(blended):
     fold, own = model.folds[0], model.index == 0
     law = fitted_law(RegressionKriging, fold.links, fold.train)
     twin = replace(model.twin, fitted=FittedModel.of_channel(law))
-    np.testing.assert_allclose(twin.predict(fold.links.select(own)).reading_db, rows["regression_kriging"][own])
+    np.testing.assert_allclose(twin.predict(fold.links.select(own)).reading_db, rows["kriging"][own])
 
 
 def test_the_twin_predicts_by_the_weights_of_the_loop(blended):

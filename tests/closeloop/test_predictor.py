@@ -57,7 +57,7 @@ def test_of_levels_without_any_cause_the_mean_is_predicted(open_ground):
 
 def test_neither_members_nor_weights_of_a_fold_see_its_readings(open_ground, monkeypatch):
     links = prepare_links(open_ground.measured(flown(open_ground, 4, part=12)), None)
-    given, weights = [], Combination({"named": (0.5, 0.5), "regression_kriging": (0.5, 0.5)}, 50.0, (1.0, 1.0))
+    given, weights = [], Combination({"named": (0.5, 0.5), "kriging": (0.5, 0.5)}, 50.0, (1.0, 1.0))
     monkeypatch.setattr(predictor, "combination", lambda held_out, *_: given.append(held_out) or weights)
     model, found = predicted(links)
     own = model.index == 2
@@ -105,6 +105,6 @@ def test_near_measurements_interpolation_wins_and_far_from_them_no_tree(open_gro
     links = prepare_links(open_ground.measured(world), None)
     _, found = predicted(links, with_rest=True)
     weights = found.combination.weights
-    interpolated = sum(weights.get(name, (0.0, 0.0))[0] for name in ("named_and_rest", "regression_kriging"))
+    interpolated = sum(weights.get(name, (0.0, 0.0))[0] for name in ("named_and_rest", "kriging"))
     grown_far = sum(far for name, (_, far) in weights.items() if name in (*FORESTS, *LEVEL_FORESTS))
     assert ratio(links, found) < 1.02 and interpolated > 0.8 and grown_far < 0.1

@@ -57,6 +57,7 @@ def test_it_is_read_as_it_was_written(sample, open_ground, tmp_path):
     assert check_report(sample) == sample
     assert set(sample) == set(report) and set(sample["error"]) == set(report["error"])
     assert set(sample["effects"][0]) == set(report["effects"][0])
+    assert {"log_distance", "regression_kriging"} <= report["baselines"].keys()  # the schema's names
 
 
 def test_other_schemas_are_refused():

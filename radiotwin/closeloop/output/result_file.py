@@ -34,6 +34,7 @@ _WORDS = {"log_distance": "the log-distance law", "segmented_log_distance": "the
           "regression_kriging": "kriging", "extra_trees": "a tree ensemble (ExtraTrees)",
           "hist_gradient_boosting": "gradient boosting (HistGradientBoosting)"}
 SCHEMA = "radiotwin.closeloop/3"
+SCHEMA_NAMES = {"kriging": "regression_kriging"}  # channel models that the schema names otherwise
 MIN_PART, AS_LARGE = 10, 0.5  # least links of a flight or octant; least share of a group's size
 REMEDY = "run `radiotwin close-loop` again"
 MAX_GROUPS = 100  # of more devices or receivers no single errors are listed
@@ -123,9 +124,9 @@ def make_report(loop: Loop) -> dict[str, Any]:
     error["combined"] = errors(links.level_db, predicted.reading_db) | {
         "in_90_percent_interval": predicted.coverage}
     error["map"] = errors(links.level_db, predicted.map_db)
-    baselines = {name: errors(links.level_db, mean_db)
+    baselines = {SCHEMA_NAMES.get(name, name): errors(links.level_db, mean_db)
                  for name, mean_db in predicted.baselines.items()}
-    combination = [{"name": name, "weight_near": near, "weight_far": far}
+    combination = [{"name": SCHEMA_NAMES.get(name, name), "weight_near": near, "weight_far": far}
                    for name, (near, far) in predicted.combination.weights.items()]
     return _for_json({
         "schema": SCHEMA, "radiotwin_version": __version__, "base": loop.base,
