@@ -298,7 +298,8 @@ def close_loop(
 def _print(report: dict[str, Any]) -> None:
     """Print anomalies, held-out errors before and after, and effects of a close-loop report."""
     from radiotwin.report import anomaly_words
-    from radiotwin.report.labels import name_label
+    from radiotwin.report.closeloop_words import errors_in_turn
+    from radiotwin.report.labels import name_label, number
 
     for note in report["notes"]:
         say(f"note: {note}")
@@ -311,14 +312,15 @@ def _print(report: dict[str, Any]) -> None:
     groups = [(name, both) for name, both in (("all", error), *error["by_los"].items())
               if both["before"]["n"]]
     scores = ("rmse_db", "mae_db", "bias_db")
-    rows = [[name, name_label(when), *(_number(both[when][key]) for key in scores)]
-            for name, both in groups
-            for when in ("before", "after", "after_with_quality") if both.get(when)]
-    rows += [[name_label(name), "", value["rmse_db"], float("nan"), float("nan")]
+    rows = [[name, when, number(values["n"]), *(_number(values[key]) for key in scores)]
+            for name, both in groups for when, values in errors_in_turn(both, report)]
+    rows += [[name_label(name), "", number(value.get("n")), value["rmse_db"], float("nan"),
+              float("nan")]
              for name, value in report["baselines"].items()]
     print_rows(
         f"Error on held-out links (by {report['heldout']['by']}) [dB], base {report['base']}",
-        {"links": "left", "": "left", "RMSE": "right", "MAE": "right", "bias": "right"}, rows)
+        {"of": "left", "": "left", "links": "right", "RMSE": "right", "MAE": "right",
+         "bias": "right"}, rows)
     rows = [[effect["name"], name, *_estimate(estimate), estimate["unit"]]
             for effect in report["effects"] for name, estimate in effect["parameters"].items()]
     if rows:

@@ -372,9 +372,9 @@ class CrossFit:
         """Return the held-out RMSE of detected links in a mask (n,) [dB]; None: of all links."""
         return _rms(self.links.level_db - self.held_out_mean_db, rows)
 
-    def rmse_on_map_db(self) -> float:
-        """Return the held-out RMSE of all detected links, predicted as by a map [dB]."""
-        return _rms(self.links.level_db - self.on_map[0])
+    def rmse_on_map_db(self, rows: np.ndarray | None = None) -> float:
+        """Return `rmse_db` of the prediction as a map has it [dB]."""
+        return _rms(self.links.level_db - self.on_map[0], rows)
 
     @cached_property
     def held_out_shadowing(self) -> tuple[np.ndarray, np.ndarray]:

@@ -171,8 +171,10 @@ class Loop(Summarised):
     @property
     def _summary(self) -> Summary:
         names = some(each.name for each in self.after.whole.effects) or "no effect"
-        error = (f"RMSE {self.before.rmse_db():.2f} dB before, "
-                 f"{self.after.rmse_on_map_db():.2f} dB after")
+        error = f"RMSE {self.before.rmse_db():.2f} dB"
+        if self.after is not self.before:
+            had_before = np.isfinite(self.before.on_map[0])
+            error += f" before, {self.after.rmse_on_map_db(had_before):.2f} dB after"
         return Summary("Loop", f"verdict {self.verdict}: {names}, base {self.base}, {error}", (
             ("verdict", self.verdict), ("effects", names), ("base", self.base),
             ("error on held-out links", error),

@@ -295,7 +295,7 @@ def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
     unknown = np.isnan(receiver_m[:, :2]).any(axis=1)
     names = links["receiver"][unknown]
     for name, rows in names.groupby(names, sort=False):
-        tally.count(f"no position of receiver {name}", "", len(rows), source.where(rows.index[0]))
+        tally.count(f"no position of receiver {name!r}", "", len(rows), source.where(rows.index[0]))
     if unknown.any():
         links, device_m = links[~unknown], device_m[~unknown]
     links, declared_as, more = _split_by_band(links)

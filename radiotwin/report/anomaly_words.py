@@ -11,6 +11,7 @@ from radiotwin.io.forms import Origin
 from radiotwin.io.texts import moment
 from radiotwin.report.labels import (
     DATES_S,
+    apart,
     join_names,
     name_label,
     origin_of,
@@ -119,7 +120,8 @@ def group(anomaly: dict, origin: Origin | None = None) -> tuple[str, bool]:
     one = anomaly["family"] in ENDS and len(members) > 1  # they have the same links
     for end, names in members.items():
         joined = (" or " if one else f" {JOINED[end]} ") if text else ""
-        text += f"{joined}{end}{'s' * (len(names) > 1)} {some_names(names)}"
+        text += f"{joined}{end}{'s' * (len(names) > 1)} "
+        text += some_names([apart(end, name) for name in names])
     text += " (they never part)" * one
     is_plural = bool(members) and len(next(iter(members.values()))) > 1
     sight = SIGHT.get(anomaly.get("sight", "all"), "")

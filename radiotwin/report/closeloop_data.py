@@ -13,7 +13,7 @@ from radiotwin.effects.base import Effect
 from radiotwin.effects.params import Parameter
 from radiotwin.effects.places import Mark
 from radiotwin.links import Links, evidence_blocks, residual_variables
-from radiotwin.report.labels import variable_label
+from radiotwin.report.labels import apart, variable_label
 from radiotwin.twin.model.model import Fit
 
 MAX_MEMBERS = 6  # devices or receivers with a panel of their own
@@ -124,7 +124,8 @@ class EffectData:
                 for member in np.unique(index[shown])}
         sd_db = {member: float(np.std(self.contribution_db[each])) for member, each in rows.items()}
         chosen = sorted(sorted(sd_db, key=lambda member: -sd_db[member])[:MAX_MEMBERS])
-        return [(f"{kind} {self.links.names[kind][member]}", rows[member]) for member in chosen
+        names = [apart(kind, name) for name in self.links.names[kind]]
+        return [(f"{kind} {names[member]}", rows[member]) for member in chosen
                 if sd_db[member] > MIN_SHARE * max(sd_db.values())]
 
 

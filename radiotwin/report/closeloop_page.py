@@ -11,6 +11,7 @@ from radiotwin.report import anomaly_words
 from radiotwin.report import closeloop_words as words
 from radiotwin.report.html import Table, read_picture, write_page
 from radiotwin.report.labels import (
+    apart,
     effect_picture,
     interpolations,
     join_names,
@@ -24,9 +25,12 @@ from radiotwin.report.labels import (
     variable_label,
 )
 
+MARKED = " Purple: what was found."  # said where it is drawn, as the next two
+FRAMED = " Framed: groups that stand out; dashed: part of their links."
+CONTRIBUTION = " Dashed: contribution of the effects to the prediction."
 MAP = ("residual_map.png", "Residual on the map",
        "Measured − predicted level on held-out links, at the position of the moving end; red: less "
-       "was measured than predicted. Purple: what was found.")
+       f"was measured than predicted.{MARKED}")
 STEPS = ("waterfall.png", "Error step by step",
          "RMSE on held-out links, which were used neither to choose nor to fit the model: the base "
          "alone, the change by each effect, and the result. Horizontal lines: other models, held "
@@ -34,16 +38,15 @@ STEPS = ("waterfall.png", "Error step by step",
 FIGURES = (  # with the panels of each
     ("groups.png", "Residual by device, receiver and flight",
      "Median of the held-out residual of the base (measured minus predicted; red: less was "
-     "measured) and its scatter. Framed: groups that stand out; dashed: part of their links.", ()),
+     f"measured) and its scatter.{FRAMED}", ()),
     ("level_map.png", "Levels on the map",
      "Measured level, level predicted while the link was held out, and their difference, at the "
      "position of the moving end.", ("measured", "predicted", "difference")),
     ("drivers.png", "Dependence of the residual",
-     "Mean held-out residual over the variables that it depends on most, with one standard error. "
-     "Dashed: contribution of the effects to the prediction. The diffraction parameter (ν of ITU-R "
-     "P.526) says how far the map reaches into the straight line: above 0 it blocks it.", ()),
+     "Mean held-out residual over the variables that it depends on most, with one standard error."
+     f"{CONTRIBUTION} The diffraction parameter (ν of ITU-R P.526) says how far the map reaches "
+     "into the straight line: above 0 it blocks it.", ()),
 )
-KINDS = {"los": "", "device": "device ", "receiver": "receiver ", "flight": "flight "}
 GROUPS = {"los": "with line of sight", "nlos": "without line of sight"}
 COLUMNS = {"n": "links", "bias_db": "bias [dB]", "std_db": "standard deviation [dB]",
            "correlation": "correlation", "rmse_db": "RMSE [dB]", "mae_db": "MAE [dB]",
@@ -86,11 +89,16 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
         BadInput: a damaged figure.
     """
     candidates, (lead, *more) = report["candidates"], words.summary(report)
-    pictures = [read_picture(folder, *figure) for figure in FIGURES]
-    is_changed = not all(each.get("is_declared") for each in report["effects"])
+    is_changed = words.has_additions(report)
+    is_marked = any(each.get("places") for each in words.found_causes(report)) or any(
+        each["members"].get("device") for each in report["anomalies"])
+    is_drawn = {MARKED: is_marked, FRAMED: bool(report["anomalies"]), CONTRIBUTION: is_changed}
+    map_picture, *pictures = [
+        read_picture(folder, name, title, _only_drawn(text, is_drawn), panels) for
+        name, title, text, panels in ((*MAP, ("before", "after") if is_changed else ()), *FIGURES)]
     return {
         "lead": lead, "more": more, "rivals": words.rivals(report), "cards": _cards(report),
-        "map": read_picture(folder, *MAP, ("before", "after") if is_changed else ()),
+        "map": map_picture,
         "steps": read_picture(folder, *STEPS),
         "anomalies": Table(anomaly_words.COLUMNS, anomaly_words.rows(report), "", 3),
         "figures": [picture for picture in pictures if picture],
@@ -116,16 +124,25 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
         "notes": report["notes"]}
 
 
+def _only_drawn(caption: str, is_drawn: dict[str, bool]) -> str:
+    """Leave sentences about what is not drawn out of a figure's caption."""
+    for sentence in (each for each, is_there in is_drawn.items() if not is_there):
+        caption = caption.replace(sentence, "")
+    return caption
+
+
 def _cards(report: dict) -> list[tuple[str, str]]:
-    """Return label and value of up to four cards: verdict, RMSE, combined RMSE, intervals."""
-    error = report["error"]
-    before, after = number(error["before"].get("rmse_db")), number(words.rmse_after_db(error))
-    unchanged = before == after and not report["effects"]
-    cards = [("verdict", words.verdict(report)),
-             ("RMSE, before and after", (before if unchanged else f"{before} → {after}") + " dB")]
-    if report.get("prediction"):
-        combined = number(report["prediction"]["combined_rmse_db"])
-        cards.append(("all that was learnt together, RMSE", f"{combined} dB"))
+    """Return label and value of up to four cards: verdict, RMSE, part of places, intervals."""
+    error, cards = report["error"], [("verdict", words.verdict(report))]
+    before, of = number(error["before"].get("rmse_db")), f"RMSE of {error['before']['n']:,} links"
+    if words.has_additions(report):
+        after = number(words.rmse_after_db(error))
+        cards.append((f"{of}, before and after", f"{before} → {after} dB"))
+    else:
+        cards.append((f"{of}, as before", f"{before} dB"))
+        parts_db = words.split_db(report)
+        if parts_db is not None:
+            cards.append(("of that, repeats at a place", f"{number(parts_db[0])} dB"))
     inside = (report["error"].get("combined") or {}).get("in_90_percent_interval")
     if inside is not None:
         cards.append(("held-out readings in its 90 % intervals", f"{100 * inside:.0f} %"))
@@ -184,17 +201,13 @@ def _error_table(report: dict, kinds: tuple[str, ...]) -> Table:
     groups = [("all links", error)] if "los" in kinds else []
     for kind in kinds:
         group = report["error"].get(f"by_{kind}", {})
-        groups += [(GROUPS.get(name, KINDS[kind] + name), both) for name, both in group.items()
+        groups += [(GROUPS.get(name, f"{kind} {apart(kind, name)}"), both)
+                   for name, both in group.items()
                    if len(group) <= MAX_ROWS and both["before"]["n"]
                    and (kind != "los" or both["before"]["n"] < report["error"]["before"]["n"])]
     for place, (label, both) in enumerate(groups):
-        rows += [[label if when == "before" else "", when,
-                  *(number(both[when].get(key)) for key in columns)]
-                 for when in ("before", "after")]
-        known = both.get("after_with_quality")
-        if known:
-            rows.append(["", "after, with each reading's own quality",
-                         *(number(known.get(key)) for key in columns)])
+        rows += [["" if row else label, when, *(number(scores.get(key)) for key in columns)]
+                 for row, (when, scores) in enumerate(words.errors_in_turn(both, report))]
         if place == 0:
             others = {label: scores for key, label in LEARNT.items()
                       if (scores := error.get(key))} | others

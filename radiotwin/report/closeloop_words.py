@@ -10,6 +10,7 @@ from radiotwin.effects.registry import effects_named
 from radiotwin.io.forms import Origin
 from radiotwin.report.anomaly_words import MAX_NAMED, group, seen_from, some_names, where
 from radiotwin.report.labels import (
+    apart,
     interpolations,
     join_names,
     name_label,
@@ -22,6 +23,9 @@ from radiotwin.report.labels import (
 
 MIN_DIFFERENCE_DB = 0.5  # of two receivers, to be worth a word: instruments' tolerance
 HALF = 0.5  # more probable than not
+WHEN = {  # rows of a table of errors
+    "before": "before", "after_same_links": "after, the same links", "after": "after",
+    "after_with_quality": "after, with each reading's own quality"}
 NOT_LOOKED_FOR, LACKING = "not looked for: ", "there is no "  # a reason, and how it goes on
 
 
@@ -42,7 +46,7 @@ def summary(report: dict) -> list[str]:
             if _is_significant(each["difference_db"])][:1]
     if _has_interpolation(report):
         rest.append("Interpolation of what remains, which explains nothing, brings the RMSE to "
-                    f"{number(report['error']['after']['rmse_db'])} dB.")
+                    f"{number(rmse_after_db(report['error']))} dB.")
     rest += [with_quality(report), (report.get("prediction") or {}).get("advice", "")]
     parts = [why, where(report)] if report["verdict"] == "effect" else [where(report), why]
     return list(filter(None, [*parts, " ".join(filter(None, rest))]))
@@ -206,6 +210,22 @@ def found_causes(report: dict) -> list[dict]:
             if each["name"] not in interpolated and not each.get("is_declared")]
 
 
+def has_additions(report: dict) -> bool:
+    """Return whether anything was added to the base: a cause, or an interpolation."""
+    return not all(each.get("is_declared") for each in report["effects"])
+
+
+def errors_in_turn(scores: dict, report: dict) -> list[tuple[str, dict]]:
+    """Return label and scores of the rows of an error table: one if nothing was added to the base.
+
+    Args:
+        scores: of some links, `before`, `after` and others of `WHEN`.
+        report: content of `closeloop.json`.
+    """
+    labels = WHEN if has_additions(report) else {"before": "before and after"}
+    return [(label, scores[when]) for when, label in labels.items() if scores.get(when)]
+
+
 def _has_interpolation(report: dict) -> bool:
     """Return whether the final model interpolates what no cause explains."""
     return not interpolations().isdisjoint(each["name"] for each in report["effects"])
@@ -264,8 +284,12 @@ def _effect_words(report: dict) -> str:
     goes = f"{'falls' if after < before else 'goes'} from {number(before)} to {number(after)} dB"
     if number(before) == number(after):
         goes = f"stays at {number(after)} dB"
+    of = ""
+    if "after_same_links" in error:  # what is told is of the base's links, unless interpolated
+        of = (f" (the last of all {error['after']['n']:,} links)" if explained and interpolated
+              else f" (the same {error['before']['n']:,} links)")
     text = (f"{start}: {'; '.join(objects(report))}{sure}. With {it} the RMSE on held-out links "
-            f"{goes}.")
+            f"{goes}{of}.")
     left = _unnamed_beside(report)
     if left is not None:
         text += (f" Beside {it} something is left that has no name (probability "
@@ -284,11 +308,15 @@ def _unnamed_beside(report: dict) -> float | None:
 
 
 def _nothing_words(report: dict) -> str:
-    """Say that nothing was found, and from which size on it would have been."""
+    """Say that nothing was found, from which size on it would have been, and what error stays."""
+    before_db = report["error"]["before"]["rmse_db"]
+    is_same = before_db is not None and not has_additions(report)
     return " ".join(filter(None, [
         "No group of links stands out, and no cause was found"
         f"{_probability_in_brackets(report, NONE)}.",
-        seen_from(report), _error_split(report)]))
+        seen_from(report),
+        f"The RMSE on held-out links stays at {number(before_db)} dB." if is_same else "",
+        _error_split(report)]))
 
 
 def _located_words(report: dict) -> str:
@@ -364,7 +392,8 @@ def _settled_for(name: str, step: int, report: dict) -> str:
         names = best.get(f"{end}s") or []
         if not names:
             continue
-        shown = ", ".join(names[:MAX_NAMED]) + " and others" * (len(names) > MAX_NAMED)
+        shown = ", ".join(apart(end, each) for each in names[:MAX_NAMED])
+        shown += " and others" * (len(names) > MAX_NAMED)
         who = f"{end}{'s' * (len(names) > 1)} {shown}"
         text = texts.get(end == "receiver", first)
         if end == "device" and len(names) == 1 and "the device" in text:
@@ -391,16 +420,29 @@ def _probability_in_brackets(report: dict, name: str) -> str:
     return f" (probability {probability(found[name])})" if name in found else ""
 
 
-def _error_split(report: dict) -> str:
-    """Split the base's RMSE into a part by place and a part by reading, whose squares add up."""
+def split_db(report: dict) -> tuple[float, float] | None:
+    """Split the base's RMSE [dB] into a part that repeats at a place and a part by reading.
+
+    Their squares add up. None if they are not known.
+    """
     step = next(iter(report["posterior"]), None)
     whole_db = report["error"]["before"]["rmse_db"]
     if step is None or None in (step["rest_db"], step["noise_db"], whole_db):
-        return ""
-    alike = "errors of the map and its materials" if _has_map(report) else "shadowing"
+        return None
     both_db = hypot(step["rest_db"], step["noise_db"])
     places_db, single_db = (whole_db * each / both_db if both_db else 0.0
                             for each in (step["rest_db"], step["noise_db"]))
+    return places_db, single_db
+
+
+def _error_split(report: dict) -> str:
+    """Say how much of the base's RMSE repeats at a place; empty if that is not known."""
+    parts_db = split_db(report)
+    if parts_db is None:
+        return ""
+    places_db, single_db = parts_db
+    alike = "errors of the map and its materials" if _has_map(report) else "shadowing"
+    whole_db = report["error"]["before"]["rmse_db"]
     return (f"Of the base's {number(whole_db)} dB, roughly {number(places_db)} dB repeat at a "
             f"place ({alike}), and {number(single_db)} dB differ from reading to reading (squares "
             "add up).")

@@ -69,6 +69,11 @@ def name_label(name: str) -> str:
     return NAMES.get(name, name.replace("_", " "))
 
 
+def apart(kind: str, name: str) -> str:
+    """Return a name to write after its kind: `'receiver'` in quotes for a receiver of that name."""
+    return f"'{name}'" if name.lower() == kind else name
+
+
 def source_label(radio_map: RadioMap) -> str:
     """Return what made a radio map: `twin:segmented_nn` -> `segmented NN`."""
     source = str(radio_map.dataset.attrs.get("source", "no source given"))

@@ -422,7 +422,7 @@ def viewer_data(run: Run) -> dict[str, Any]:
 
 def marks(run: Run) -> list[str]:
     """Explain the marks of the viewer that are on this page, a sentence for each kind."""
-    devices = device_layer(run)
+    devices = device_layer(run)[:MAX_DEVICES]
     estimated = [each for each in devices if each["estimate"]]
     sentences = {
         "Diamonds: anchors.": any(each["role"] == "anchor" and each["true"] for each in devices),

@@ -97,7 +97,7 @@ def test_a_column_for_each_receiver(bring_in, tmp_path):
                           {"level": "*_l", "receiver": "*", "x": "*_x", "y": "*_y"}])
     assert result.table[["receiver", "receiver_x_m", "receiver_y_m", "rssi_dbm"]].values.tolist() == [
         ["roof", 100, 0, -70], ["bus", 7, 8, -80]]
-    assert reasons(result) == {"no position of receiver yard": 1}
+    assert reasons(result) == {"no position of receiver 'yard'": 1}
 
 
 def test_a_height_in_the_file_holds_for_positions_of_a_table(bring_in, tmp_path):
@@ -132,7 +132,7 @@ def test_read_is_kept_and_left_out(bring_in):
     text = "cell,lat,lon,level\na,48,11,-80\na,0,0,-80\na,,,-80\n,48,11,-80\na,48,11,0\na,48,11,-80\n"
     result = bring_in(text, columns={"device": "cell", "latitude": "lat", "longitude": "lon", "level": "level"})
     assert reasons(result) == {"impossible level": 1, "no device": 1, "latitude, longitude 0, 0 (no fix)": 1,
-                               "no position of receiver receiver": 1, "repeats an earlier row exactly": 1}
+                               "no position of receiver 'receiver'": 1, "repeats an earlier row exactly": 1}
     assert result.report["readings"] == result.report["kept"] + sum(reasons(result).values())
 
 

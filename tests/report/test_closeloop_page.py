@@ -193,7 +193,7 @@ def test_the_member_that_others_are_compared_with_is_marked_and_no_table_is_empt
     loop._print(report("located", effects=[DRIFT | {"parameters": vague}]) | known)
     groups, errors, added = printed.values()
     assert [[row[0], *row[2:5]] for row in groups] == [["device d3", "level", "−5.6 dB", "−6.1 to −5.1"]]
-    assert [row[1:3] for row in errors] == [["before", 3.0], ["after", 2.0], ["after with quality", 1.0]]
+    assert [row[1:4] for row in errors] == [["before", "900", 3.0], ["after", "900", 2.0], ["after, with each reading's own quality", "900", 1.0]]
     assert added[0][2] == "not determined" and added[0][3] != added[0][3]
 
 
@@ -349,7 +349,6 @@ def test_the_page_tells_how_far_intervals_can_be_trusted(tmp_path):
     error = report()["error"] | {"combined": SCORES | {"rmse_db": 1.9, "in_90_percent_interval": 0.874}}
     text = page(report(prediction=prediction, error=error), tmp_path)
     assert "held-out readings in its 90 % intervals" in text and "87 %" in text
-    assert "<dt>all that was learnt together, RMSE</dt><dd>1.90 dB</dd>" in text
     error["combined"] = SCORES  # of a file that was written before
     assert "in its 90 % intervals" not in page(report(prediction=prediction, error=error), tmp_path)
 
@@ -362,3 +361,41 @@ def test_times_since_1970_are_dates_and_no_other_quantity_is(tmp_path):
     page = (tmp_path / "closeloop.html").read_text(encoding="utf-8")
     assert "2026-05-12 02:58:50" in page and "2026-05-12 01:40:00" in page and "1778554730" not in page
     assert "60.00 to 80.00" in page
+
+
+def test_where_nothing_was_found_the_error_stays_and_its_part_of_places_is_shown(tmp_path):
+    roofs = DRIFT | {"is_declared": True}
+    nothing = report("none", effects=[roofs])
+    text = page(nothing, tmp_path)
+    assert "The RMSE on held-out links stays at 3.00 dB. Of the base&#39;s 3.00 dB, roughly 2.68 dB repeat at a place" in text
+    assert "<dt>RMSE of 900 links, as before</dt><dd>3.00 dB</dd>" in text
+    assert "<dt>of that, repeats at a place</dt><dd>2.68 dB</dd>" in text
+    assert "3.00 → " not in text and ">before and after</td>" in text and ">after</td>" not in text
+
+
+def test_errors_of_other_links_are_no_headline_and_are_labelled(tmp_path):
+    error = report()["error"] | {"after_same_links": SCORES | {"n": 900, "rmse_db": 2.4},
+                                 "after": SCORES | {"n": 1100, "rmse_db": 2.2}}
+    text = page(report(error=error), tmp_path)
+    assert "falls from 3.00 to 2.40 dB (the same 900 links)." in text
+    assert "<dt>RMSE of 900 links, before and after</dt><dd>3.00 → 2.40 dB</dd>" in text
+    assert "2.20" not in text[:text.index("<h2>")]
+    assert re.search(r"after, the same links</td><td>900</td>.*2\.40", text)
+    assert re.search(r">after</td><td>1,100</td>.*2\.20", text)
+
+
+def test_a_name_that_is_the_word_for_its_kind_is_quoted(tmp_path):
+    named = LOW | {"members": {"device": ["d3"], "receiver": ["receiver"]}, "family": "device x receiver"}
+    found = report("located", anomalies=[named])
+    found["error"]["by_flight"] = {"flight": {"before": SCORES, "after": SCORES}}
+    text = page(found, tmp_path)
+    assert "Device d3 with receiver &#39;receiver&#39; reads" in text and "receiver receiver" not in text
+    assert "flight &#39;flight&#39;" in text
+
+
+@pytest.mark.parametrize("verdict, is_drawn", [("located", True), ("none", False)])
+def test_captions_explain_what_is_drawn_alone(tmp_path, verdict, is_drawn):
+    for name in ("residual_map", "groups"):
+        Figure().savefig(tmp_path / f"{name}.png")
+    text = page(report(verdict), tmp_path)
+    assert ("Purple: what was found" in text, "Framed: groups" in text) == (is_drawn, is_drawn)

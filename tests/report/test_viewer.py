@@ -1,10 +1,13 @@
 """The page in a real browser: it shows the run's own numbers, and its controls move what they say."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
 
 from radiotwin.report import Run, read_run, write_report
+from radiotwin.report.viewer_data import marks
 from radiotwin.twin import Twin, TwinDevice
 from radiotwin.twin.model.model import FittedModel
 
@@ -184,3 +187,10 @@ def test_nothing_is_wider_than_the_page(opened, path, width):
     assert page.evaluate("document.documentElement.scrollWidth") <= width
     page.emulate_media(color_scheme="dark")
     assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(20, 25, 30)"
+
+
+@pytest.mark.parametrize("is_true_known", [True, False])
+def test_orange_circles_are_explained_where_true_positions_are_drawn(run, is_true_known):
+    said = " ".join(marks(run if is_true_known else replace(run, scene=None)))
+    assert ("Orange circles" in said) == is_true_known
+    assert "Diamonds" in said and "Red crosses" in said

@@ -65,14 +65,16 @@ def compare_with_baselines(error: dict[str, Any],
         return None
     best = min(rmse_db, key=lambda name: rmse_db[name])
     words, best_db = _WORDS.get(best, best), rmse_db[best]
+    links = f"all {error['combined']['n']:,} held-out links"
     if best_db <= AS_GOOD * combined_db:
         plain = "a plain regression" if best in _WORDS else "a published law"
-        advice = (f"For prediction alone {plain} would do: {words} {best_db:.2f} dB, "
-                  f"all that was learnt together {combined_db:.2f} dB.")
+        advice = (f"For prediction alone {plain} would do: {words} {best_db:.2f} dB, all that was "
+                  f"learnt together {combined_db:.2f} dB, on {links}.")
     else:
         gain = 100 * (1 - combined_db / best_db)
-        advice = (f"All that was learnt together predicts to {combined_db:.2f} dB, {gain:.0f} % "
-                  f"better than the best other model ({words} alone: {best_db:.2f} dB).")
+        advice = (f"All that was learnt together predicts {links} to {combined_db:.2f} dB, "
+                  f"{gain:.0f} % better than the best other model ({words} alone: "
+                  f"{best_db:.2f} dB).")
     after_db = error["after"]["rmse_db"]
     if after_db is not None and after_db > AS_GOOD * best_db:
         advice += f" The base with all that was found is behind {words}: {after_db:.2f} dB."
