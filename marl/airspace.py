@@ -38,7 +38,7 @@ def keep_out(scene: Scene, areas: Sequence[BaseGeometry], clearance_m: float) ->
 
 
 def _near_buildings(scene: Scene, clearance_m: float) -> np.ndarray:
-    """Return the mask (nz, ny, nx) of lattice positions whose moves violate the clearance [m].
+    """Return the mask (nz, ny, nx) of lattice positions where moves are too close to buildings.
 
     Horizontal sections of the city, at each altitude and below it, are tested on a finer grid.
     """

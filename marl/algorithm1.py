@@ -212,7 +212,7 @@ class Campaign:
     def learn(self, learner: Learner | None, rng: np.random.Generator) -> None:
         """Fly a real episode, and fit the twin to all measurements so far.
 
-        Given measurements are fitted once. With a perfect twin nothing is done.
+        Measurements from a file are fitted once. If the truth is the twin, nothing is done.
 
         Args:
             learner: learner whose policy may fly; None if measurements were given.
@@ -231,7 +231,7 @@ class Campaign:
 
     def log(self, learner: Learner, mission: Mission, rng: np.random.Generator,
             simulated: int) -> None:
-        """Evaluate the policy in the twin and in the truth, if there are, and add a row to the log.
+        """Evaluate the policy in the maps of twin and truth, and add a row to the log; NaN without.
 
         Args:
             learner: learner that was prepared in this round.

@@ -133,7 +133,7 @@ class Belief:
     def expected_data(self) -> np.ndarray:
         """Return the expected data units (U, K, ny, nx) of a slot on each link.
 
-        It is given that the device transmits.
+        It is conditional on the device transmitting, see `silent`.
         """
         prior = self.prior
         mission = self._mission
@@ -162,7 +162,7 @@ def _hear(prior: Prior, state: _State, uav: int, level: int, row: int, column: i
         level: level of its map.
         row: row of its cell.
         column: column of its cell.
-        kept: correlation of the map's error with that at its last cell.
+        kept: correlation of the map's error here with that at the UAV's last cell.
         snr_db: (K,) readings; -inf = not detected.
         limit_db: limit of detection [dB].
     """
@@ -256,7 +256,7 @@ def _value(prior: Prior, state: _State, weight: np.ndarray, levels: np.ndarray, 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _looked_up(table: np.ndarray, snr_db: float, sd_db: float) -> float:
-    """Interpolate the table of expected data bilinearly."""
+    """Interpolate the table of expected data bilinearly at a mean SNR and its sd [dB]."""
     x = min(max((snr_db + 60.0) * 2.0, 0.0), table.shape[0] - 1.000001)
     y = min(max(sd_db * 2.0, 0.0), table.shape[1] - 1.000001)
     a, b = int(x), int(y)

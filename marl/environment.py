@@ -195,7 +195,7 @@ def feasible(mission: Mission, uav: int, row: int, column: int, battery: int,
 
 
 def safe_actions(action: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Replace infeasible actions (E, U), by a mask (E, U, 6), by the first feasible one.
+    """Replace actions (E, U) that the `mask` (E, U, 6) forbids by the first feasible action.
 
     That is to hover if the battery allows it, else a move from which home can be reached, and the
     no-op after landing.
@@ -217,7 +217,7 @@ def assign(strength: np.ndarray, max_rate: bool, out: np.ndarray) -> None:
 
     Args:
         strength: (U, K) strength of each link, -inf = not usable; overwritten.
-        max_rate: see `Mission`.
+        max_rate: whether a UAV that loses its best device gets none, not its next best.
         out: (U,) device or -1, overwritten.
     """
     out[:] = -1
@@ -246,7 +246,10 @@ def assign(strength: np.ndarray, max_rate: bool, out: np.ndarray) -> None:
 @njit(cache=True, nogil=True)
 def _sense(mission: Mission, frame: Frame, flying: np.ndarray, lasting: np.ndarray,
            rng: np.random.Generator) -> None:
-    """Draw the SNRs of a slot, and assign devices, in the flights of the mask `flying` (E,)."""
+    """Draw the SNRs of a slot into `frame`, and assign devices, in the flights `flying` (E,).
+
+    `lasting` (E, K, ny, nx) is the part of the shadowing that lasts for a flight [sd].
+    """
     uavs, devices = len(mission.start), len(mission.data_units)
     of_slot = np.sqrt(1.0 - mission.shadowing_share)
     strength = np.empty((uavs, devices))
@@ -356,7 +359,7 @@ def _length_scale_m(mission: Mission) -> float:
 
 @njit(cache=True, nogil=True)
 def _observe(mission: Mission, frame: Frame, observation: np.ndarray, mask: np.ndarray) -> None:
-    """Write the observations and feasible actions of `observe`."""
+    """Write each UAV's observation, scaled to about one, and its feasible actions (`mask`)."""
     flights, uavs, devices = frame.snr_db.shape
     scale_m = _length_scale_m(mission)
     for e in range(flights):
@@ -408,7 +411,7 @@ def _observe(mission: Mission, frame: Frame, observation: np.ndarray, mask: np.n
 
 @njit(cache=True, nogil=True)
 def _global_state(mission: Mission, frame: Frame, state: np.ndarray) -> None:
-    """Write the global state of `global_state`."""
+    """Write the features of all UAVs and devices into `state` (E, state_size)."""
     flights, uavs, devices = frame.snr_db.shape
     scale_m = _length_scale_m(mission)
     for e in range(flights):

@@ -111,7 +111,7 @@ def _tanh(x: np.float32) -> np.float32:
 def _cell(r: np.ndarray, z: np.ndarray, n: np.ndarray, u: np.ndarray, r_h: np.ndarray,
           z_h: np.ndarray, n_h: np.ndarray, n_bias: np.ndarray, before: np.ndarray,
           after: np.ndarray) -> None:
-    """Compute the gates and hidden states of one slot in place."""
+    """Compute the gates r, z, n and u, and the hidden states `after`, of one slot in place."""
     for b in range(len(before)):
         for i in range(len(n_bias)):
             r[b, i] = _HALF + _HALF * _tanh(_HALF * (r[b, i] + r_h[b, i]))
@@ -143,7 +143,10 @@ def _forward(work: np.ndarray, recurrent: np.ndarray, n_bias: np.ndarray, memori
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _cell_backward(gradient: np.ndarray, r: np.ndarray, z: np.ndarray, n: np.ndarray,
                    u: np.ndarray, before: np.ndarray, carried: np.ndarray) -> None:
-    """Replace the gates of one slot by the gradients by them, and update the carried gradient."""
+    """Replace the gates of one slot by the loss's gradients by them; update `carried` in place.
+
+    `carried` is the gradient by the hidden state that goes on to the slot before.
+    """
     for b in range(len(before)):
         for i in range(before.shape[1]):
             r_bi, z_bi, n_bi = r[b, i], z[b, i], n[b, i]
@@ -159,7 +162,7 @@ def _cell_backward(gradient: np.ndarray, r: np.ndarray, z: np.ndarray, n: np.nda
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _backward(gradient: np.ndarray, recurrent: np.ndarray, memories: np.ndarray, work: np.ndarray,
               before: np.ndarray, sizes: np.ndarray) -> None:
-    """Run all slots backwards: replace the gates in `work` by gradients, and fill `before`."""
+    """Run all slots backwards: turn `work` into gradients, and fill `before` with prior states."""
     hidden = gradient.shape[1]
     carried = np.zeros((sizes[0], hidden), np.float32)
     share = np.empty((3, sizes[0], hidden), np.float32)

@@ -169,10 +169,10 @@ def _move_towards_point(mission: Mission, row: int, column: int, target_m: np.nd
 
 @njit(cache=True, nogil=True)
 def weighed_actions(mission: Mission, frame: Frame, weights: np.ndarray) -> np.ndarray:
-    """Return actions (E, U) towards distinct devices, assigned by the highest score first.
+    """Return actions (E, U) towards the device with the best score, see `WEIGHTS`.
 
-    A UAV left without a device of its own flies to its best one. If no move towards it is feasible,
-    the UAV hovers as long as it can and then flies home.
+    Each device goes to one UAV, the highest score first. A UAV that gets none flies to its best
+    one. If no move towards it is feasible, the UAV hovers while it can, then flies home.
 
     Args:
         mission: mission with the known positions of the devices.

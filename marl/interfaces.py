@@ -172,7 +172,7 @@ class CentralVectorEnv(VectorEnv[Arrays, np.ndarray, np.ndarray]):
 
     def step(self, actions: np.ndarray,
              ) -> tuple[Arrays, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Fly one slot with actions (E, U); see `gymnasium.vector.VectorEnv`."""
+        """Fly one slot with actions (E, U), infeasible ones replaced; see Gymnasium."""
         environment, anew = self._environment, self._over
         wanted = np.where(anew[:, None], NO_OP, actions)
         action = safe_actions(wanted, observe(self.mission, environment.frame)[1])

@@ -88,7 +88,7 @@ class Candidates(NamedTuple):
 
     @classmethod
     def of(cls, value: np.ndarray) -> "Candidates":
-        """Return empty lists for a map, which several searches can share."""
+        """Return lists for a map, to be filled when a cell is used; searches may share them."""
         levels, devices, rows, columns = value.shape
         strongest = value.reshape(levels, devices, -1).argmax(axis=2)
         shape = (levels * rows * columns, devices)
@@ -340,7 +340,7 @@ def take_off(mission: Mission, devices: int) -> TourFlight:
 @njit(cache=True, nogil=True, error_model="numpy")
 def fly_on(mission: Mission, value: np.ndarray, tour: np.ndarray, count: np.ndarray,
            flight: TourFlight, actions: np.ndarray) -> None:
-    """Fly T slots along the tours with the expected data; write the `actions` (T, U)."""
+    """Fly T slots along tours, with expected data; update `flight` and write `actions` (T, U)."""
     cell, battery, left, reached, hovered, strength, assigned, mask = flight
     uavs, devices = strength.shape
     for slot in range(len(actions)):
@@ -366,7 +366,7 @@ def fly_on(mission: Mission, value: np.ndarray, tour: np.ndarray, count: np.ndar
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _list(candidates: Candidates, level: int, row: int, column: int, place: int) -> None:
-    """Fill the list of devices in reach of a place, the strongest first."""
+    """Fill the entry of a place in `candidates`: all devices, the strongest link first."""
     heard = candidates.value[level, :, row, column]
     order = np.argsort(-heard, kind="mergesort")  # stable: of equal links the first device
     candidates.device[place], candidates.worth[place] = order, heard[order]
@@ -376,7 +376,7 @@ def _list(candidates: Candidates, level: int, row: int, column: int, place: int)
 @njit(cache=True, nogil=True, error_model="numpy")
 def _walk(mission: Mission, candidates: Candidates, uav: int, tour: np.ndarray, count: int,
           changed: int, course: Course, mask: np.ndarray) -> None:
-    """Simulate one UAV's moves from the slot in which it sets out to the waypoint `changed`."""
+    """Simulate one UAV's moves from when it sets out to the waypoint `changed`, into `course`."""
     level, (rows, columns) = mission.level[uav], mission.steps_home.shape[1:]
     places, batteries, since = course.place[:, uav], course.battery[uav], course.since[uav]
     slot, reached, hovered = since[changed], changed, 0

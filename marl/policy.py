@@ -98,7 +98,7 @@ class Seen(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _spread(rate: np.ndarray, away: np.ndarray) -> None:
-    """Compute `Outlook.away` from rates by a two-pass distance transform."""
+    """Fill `away`, the costs of `Outlook.away`, from rates by a two-pass distance transform."""
     levels, devices, rows, columns = rate.shape
     for level, k in np.ndindex(levels, devices):
         for p in range(len(PRICES)):
@@ -120,7 +120,7 @@ def _spread(rate: np.ndarray, away: np.ndarray) -> None:
 
 @njit(cache=True, nogil=True)
 def _look(mission: Mission, outlook: Outlook, frame: Frame, e: int, seen: Seen, n: int) -> int:
-    """Write the features of the flying UAVs of flight `e` from row `n` on; return the next row."""
+    """Write features of flight `e`'s flying UAVs to `seen` from row `n`; return the next row."""
     battery, left = frame.battery[e], frame.data_units[e]
     uavs, devices = len(battery), len(left)
     mask, drain, waiting = np.empty(ACTION_COUNT, np.bool_), np.zeros(devices), left > 0
@@ -170,7 +170,11 @@ def _look(mission: Mission, outlook: Outlook, frame: Frame, e: int, seen: Seen, 
 @njit(cache=True, nogil=True)
 def _look_at(mission: Mission, outlook: Outlook, frame: Frame, e: int, u: int, k: int,
              drain: float, mean_left: float, slack: float, token: np.ndarray) -> None:
-    """Write the token of device `k` for UAV `u` of flight `e`; `drain` is in slots."""
+    """Write the features of device `k` for UAV `u` of flight `e` to `token` (TOKEN,).
+
+    `drain` is the slots needed to collect its data, `mean_left` the mean data of waiting devices,
+    `slack` the battery beyond the way home [hovers].
+    """
     level, row, column = mission.level[u], frame.cell[e, u, 0], frame.cell[e, u, 1]
     battery, left, assigned = frame.battery[e], frame.data_units[e], frame.assigned[e]
     away = outlook.away[level, k, row, column]
@@ -211,7 +215,7 @@ def _look_at(mission: Mission, outlook: Outlook, frame: Frame, e: int, u: int, k
 
 @njit(cache=True, nogil=True)
 def _look_around(mission: Mission, outlook: Outlook, frame: Frame, seen: Seen) -> int:
-    """Write the features of all flying UAVs of all flights of a mission; return their number."""
+    """Write the features of all UAVs flying in a mission to `seen`; return their number."""
     n = 0
     for e in range(len(frame.battery)):
         n = _look(mission, outlook, frame, e, seen, n)
@@ -221,7 +225,7 @@ def _look_around(mission: Mission, outlook: Outlook, frame: Frame, seen: Seen) -
 @njit(cache=True, nogil=True)
 def _look_everywhere(missions: "List[Mission]", outlooks: "List[Outlook]", frames: "List[Frame]",
                      seen: Seen) -> int:
-    """Write the features of all flying UAVs of one flight in each world; return their number."""
+    """Write the features of all UAVs flying in many worlds to `seen`; return their number."""
     n = 0
     for w in range(len(missions)):
         n = _look(missions[w], outlooks[w], frames[w], 0, seen, n)

@@ -66,7 +66,9 @@ class Promise:
 
 def promise(prior: Prior, mission: Mission, worlds: int, iterations: int, seed: int,
             on_progress: Callable[[int], None] = lambda _: None) -> Promise:
-    """Search plans, choose the best, and evaluate it in possible worlds.
+    """Search plans, choose the best, and evaluate it in worlds drawn from the prior.
+
+    Each plan is made in a map lowered by another `CAUTION`; a few worlds choose the best.
 
     Args:
         prior: prior of the belief, see `marl.worlds.twin_prior`.
@@ -97,7 +99,10 @@ def promise(prior: Prior, mission: Mission, worlds: int, iterations: int, seed: 
 
 
 def _cautious(prior: Prior, caution: float) -> Prior:
-    """Lower a prior's levels by `caution` standard deviations of their lasting errors."""
+    """Lower a prior's SNRs by `caution` standard deviations of errors that last for a flight.
+
+    Only errors that change in every slot remain uncertain.
+    """
     if not caution:
         return prior
     of_device = prior.level_sd_db**2 + prior.common_sd_db**2
@@ -110,7 +115,10 @@ def _cautious(prior: Prior, caution: float) -> Prior:
 
 def _flown(found: Plan, real: Mission, transmits: np.ndarray,
            rng: np.random.Generator) -> tuple[float, np.ndarray]:
-    """Fly a plan in a world; return the share of all data, and of each device's (K,), collected."""
+    """Fly a plan in a world; return the collected share of all data, and of each device's (K,).
+
+    The latter is NaN for silent devices. Without any data, the share is 1.
+    """
     flights = evaluate(real, PlanPolicy(found.actions), 1, rng)
     served, taken = flights.frames.assigned[0], np.zeros(real.devices)
     np.add.at(taken, served[served >= 0], flights.collected[0][served >= 0])

@@ -84,7 +84,7 @@ class ReplanPolicy:
         return action
 
     def _meet(self, frame: Frame, flight: int) -> None:
-        """Exchange readings and planned tours between UAVs whose link exceeds the threshold."""
+        """Exchange readings and planned tours between UAVs whose SNR reaches the threshold."""
         mission, minds = self._mission, self._flights[flight]
         cell = frame.cell[flight].astype(float) * mission.step_m
         for u, mind in enumerate(minds):
@@ -108,7 +108,7 @@ class ReplanPolicy:
                           self._hovered[flight, u])
 
     def _search(self, frame: Frame, flight: int) -> None:
-        """Improve the remaining tours of a flight: all at once with a link, else one by one."""
+        """Improve a flight's remaining tours: of linked UAVs all together, of others one by one."""
         cell, battery = (array[flight].astype(np.int64) for array in (frame.cell, frame.battery))
         tours = [self._remaining_tour(flight, u) for u in range(self._mission.uavs)]
         for u, mind in enumerate(self._flights[flight]):
@@ -124,7 +124,11 @@ class ReplanPolicy:
 
     def _believed_of_others(self, mind: "_Mind",
                             ) -> tuple[np.ndarray, np.ndarray, list[tuple[np.ndarray, int]]]:
-        """Return cells, batteries and remaining tours of all UAVs, as one UAV assumes them."""
+        """Return cells, batteries and remaining tours of all UAVs, as one UAV assumes them.
+
+        UAVs that it met are assumed to fly the tours of that meeting, others those of the first
+        plan.
+        """
         cells, batteries, _, *passed = (array[self._slot] for array in self._expected)
         cells, batteries = cells.copy(), batteries.copy()
         tours = [_remaining(self._first.tour[v], self._first.visits[v], passed[0][v], passed[1][v])
@@ -144,7 +148,7 @@ class ReplanPolicy:
     def _left(self, mind: "_Mind") -> np.ndarray:
         """Return the data (K,) that a UAV without a link assumes to be left.
 
-        It is the amount seen last, reduced by the share that the first plan collects since then.
+        It is the amount seen last, less the share that the first plan would have collected since.
         """
         planned, devices = self._expected[2], np.arange(self._mission.devices)
         before = planned[mind.seen_in, devices]
@@ -153,7 +157,7 @@ class ReplanPolicy:
 
     def _improved(self, mind: "_Mind", cell: np.ndarray, battery: np.ndarray, left: np.ndarray,
                   tours: list[tuple[np.ndarray, int]], only: int) -> Plan | None:
-        """Improve tours by the belief of a UAV (or of all); None if no data are left."""
+        """Improve the tour of UAV `only` (-1: all) by a UAV's belief; None if no data are left."""
         data_units, value = np.maximum(left, 0.0).astype(float), self._value
         if mind.belief is not None:
             data_units, value = weighted(mind.belief, data_units)
@@ -165,7 +169,7 @@ class ReplanPolicy:
                        only=only, temperature=LOW_TEMPERATURE)
 
     def _take(self, flight: int, uavs: Iterable[int], found: Plan | None) -> None:
-        """Replace the tours of some UAVs in a flight by those of a plan."""
+        """Replace the tours of some UAVs in a flight by those of a plan; None: keep them."""
         if found is not None:
             for u in uavs:
                 self._tour[flight, u], self._count[flight, u] = found.tour[u], found.visits[u]
@@ -194,7 +198,7 @@ class _Mind:
             u: [] for u in range(mission.uavs)}
 
     def look(self, frame: Frame, flight: int, slot: int) -> None:
-        """Update the belief and the data left by the SNRs that its UAVs receive in a slot."""
+        """Update belief and data left by what the UAVs of this mind receive in a slot."""
         for u in self._uavs:
             if not frame.battery[flight, u]:
                 continue
@@ -205,7 +209,7 @@ class _Mind:
             self._hear(u, slot, frame.cell[flight, u].astype(np.int64), snr_db.copy())
 
     def learn_from(self, other: "_Mind") -> None:
-        """Take over another UAV's readings, and the data left that it has seen later."""
+        """Copy another UAV's new readings, and its counts of data left that are more recent."""
         later = other.seen_in > self.seen_in
         self.seen = np.where(later, other.seen, self.seen)
         self.seen_in = np.where(later, other.seen_in, self.seen_in)
@@ -282,7 +286,7 @@ def _follow(mission: Mission, frame: Frame, tour: np.ndarray, count: np.ndarray,
 @njit(cache=True, nogil=True, error_model="numpy")
 def _expected_flight(mission: Mission, value: np.ndarray, tour: np.ndarray, count: np.ndarray,
                      ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Simulate a plan with the expected data.
+    """Simulate the tours of a plan; each link yields its expected data `value` in a slot.
 
     Returns:
         state at the beginning of every slot: cells (T, U, 2), batteries (T, U), data left (T, K),

@@ -142,7 +142,7 @@ def result_of(call: "Future[Any]") -> Any:
     try:
         return call.result()
     except TerminatedWorkerError as error:
-        if "SIGTERM" in str(error):  # sent to all, and to this one as well
+        if "SIGTERM" in str(error):  # the signal was sent to all processes, also to this one
             raise SystemExit(143) from None
         raise RunFailed("a process that trains has ended, perhaps for lack of memory; start the "
                         "same command with --resume to go on from the last checkpoint") from None

@@ -166,7 +166,7 @@ class Session:
 
     def _write(self, scene: Scene, truth: RadioMap, main: Outcome, curves: dict[str, list[dict]],
                entries: list[dict]) -> pd.DataFrame:
-        """Add the baselines, write tables and figures, and print the table."""
+        """Evaluate the baselines, write tables and figures, and print and return the comparison."""
         real = make_mission(scene, truth, main.known, self.run.assignment)
         trained_in = real
         if main.twin is not None:

@@ -185,7 +185,7 @@ def check_together(learner: LearnerSettings) -> None:
     """Refuse settings of learning that are allowed one by one, but not together.
 
     Raises:
-        BadInput: a replay memory that is smaller than a batch.
+        BadInput: a replay memory smaller than a batch, or than the flights simulated at a time.
     """
     if learner.batch > learner.replay or learner.parallel > learner.replay:
         raise BadInput(

@@ -36,7 +36,10 @@ class Exploration:
         self._left = np.zeros((flights, uavs), dtype=np.int64)
 
     def change(self, action: np.ndarray, mask: np.ndarray) -> np.ndarray:
-        """Replace some of a policy's actions (E, U) by random feasible ones of a mask (E, U, 6)."""
+        """Replace some of a policy's actions (E, U) by random ones that `mask` (E, U, 6) allows.
+
+        A random action is repeated for some slots, and ends early if it becomes infeasible.
+        """
         begins = (self._rng.random(action.shape) < self._begin) & (self._left == 0)
         lots = np.where(mask, self._rng.random(mask.shape), -1.0).argmax(axis=-1)
         self._kept[begins] = lots[begins]

@@ -71,7 +71,10 @@ def twin_prior(twin: Twin, scene: Scene, radio_map: RadioMap, rng: np.random.Gen
 
 def draw_positions(twin: Twin, row: int, scene: Scene, count: int,
                    rng: np.random.Generator) -> np.ndarray:
-    """Draw positions (count, 3) of a twin's device by row, outside buildings [m]; zeros for -1."""
+    """Draw positions (count, 3) of a twin's device outside buildings [m]; zeros for row -1.
+
+    They follow the credible radius, or are uniform if the device was not located.
+    """
     if row < 0:
         return np.zeros((count, 3))
     device = twin.devices[row]
@@ -119,7 +122,7 @@ class WorldSource:
         self._field = CorrelatedField(prior.snr_db.shape[3:], mission.step_m, prior.length_m)
 
     def draw(self, rng: np.random.Generator) -> tuple[Mission, np.ndarray]:
-        """Draw a mission, and the mask (K,) of devices that transmit; the others have no data."""
+        """Draw a world: a mission, and the mask (K,) of devices that transmit and have data."""
         prior, mission = self._prior, self._mission
         devices, candidates = prior.weight.shape
         snr_db = np.empty(mission.snr_db.shape, np.float32)

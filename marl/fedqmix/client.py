@@ -145,7 +145,7 @@ class Client:
             self._replica.judge(mean)
 
     def _log(self) -> None:
-        """Evaluate the policy of a real episode, and write the log."""
+        """Evaluate the policy learnt in a real episode, and write `metrics.csv`."""
         campaign, replica = self._campaign, self._replica
         campaign.log(replica, replica.mission, stream(self._run.seed, "decisions"),
                      replica.episodes)

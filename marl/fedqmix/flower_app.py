@@ -112,7 +112,7 @@ def party_of(context: Context, shared: Shared) -> Party:
     if "partition-id" in given:  # of the simulation engine
         given = read_json(shared.parties)[int(given["partition-id"])]
     else:
-        # One that outlives its killed SuperNode would write over what the next one does.
+        # A party that outlives its killed SuperNode would overwrite the files of the next one.
         die_with_parent(os.getppid())
     missing = [name for name in _NEEDED if name not in given]
     odd = [name for name in given if name not in _NEEDED + _OPTIONAL]
@@ -132,7 +132,7 @@ def party_of(context: Context, shared: Shared) -> Party:
 
 @server_app.main()
 def main(grid: Grid, context: Context) -> None:
-    """Coordinate all rounds, then ask each party to evaluate its policy."""
+    """Average the parties' weights in every round, then ask each party to evaluate its policy."""
     shared = Shared.of(context.run_config)
     like = mean = initial_weights(shared)
     folder = Path(shared.out or f"federation-{context.run_id}")

@@ -128,7 +128,7 @@ def _listed(text: str) -> list[Path]:
 
 
 def node_config(party: Party) -> dict[str, str | int]:
-    """Return the `--node-config` of a party's SuperNode."""
+    """Return the `--node-config` of a party's Flower SuperNode."""
     given = {name: value for name, value in asdict(party).items() if value is not None}
     given["out"] = given.pop("folder")
     return {name: str(value.absolute()) if isinstance(value, Path) else value

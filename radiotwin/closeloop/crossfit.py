@@ -1,7 +1,8 @@
 """Cross-validate a base model and its effects: folds, bases, held-out predictions.
 
 A base is a channel model with a way to locate unknown devices. It is fitted to all links, and once
-for each fold to the links outside that fold. Effects have to explain its held-out residual.
+for each fold to the links outside that fold. Effects, causes that the base lacks, have to explain
+its held-out residual.
 """
 
 from __future__ import annotations
@@ -74,7 +75,7 @@ def make_folds(links: Links, seed: int, by: str = "auto") -> Folds:
         links: n links.
         seed: random seed of the assignment.
         by: one of `WAYS`; or `auto`: by flight if devices and receivers typically are in at least
-            `MIN_FLIGHTS` flights, else by blocks on the ground.
+            `MIN_FLIGHTS` flights, else by blocks of ground. By device only anchors are held out.
 
     Raises:
         BadInput: an unknown way, or too few flights, quadrants or anchors for it.
@@ -302,9 +303,9 @@ class CrossFit:
 
     @cached_property
     def held_out_reading(self) -> tuple[np.ndarray, np.ndarray]:
-        """(n,) held-out predicted reading and (n,) its error scale [dB], with shadowing.
+        """(n,) held-out level, predicted as if there were no limit of detection; its scale [dB].
 
-        NaN where the fold could not locate the device.
+        Interpolated shadowing is included. NaN where the fold could not locate the device.
         """
         mean_db, scale_db, unheard_db = self._held_out_parts
         shift, left = self.held_out_shadowing
@@ -328,7 +329,7 @@ class CrossFit:
 
     @cached_property
     def held_out_mean_db(self) -> np.ndarray:
-        """(n,) held-out mean level, given that the link is detected [dB]; NaN without one."""
+        """(n,) held-out mean level, given that the link is detected [dB]; NaN if not predicted."""
         reading = self.held_out_reading
         return self.held_out(lambda fold: np.where(
             fold.usable, ReadingLaw(*reading, fold.model.limit_db, fold.model.dof,
@@ -342,10 +343,10 @@ class CrossFit:
 
     @cached_property
     def on_map(self) -> tuple[np.ndarray, np.ndarray]:
-        """(n,) held-out mean [dB] and (n,) negative log-likelihood [nats], as from a map.
+        """(n,) held-out mean [dB] and (n,) negative log-likelihood [nats], as a map would predict.
 
-        A map does not know a link's quality: the prediction is averaged over the qualities of the
-        training links.
+        A map does not know the column `quality` of a link, so the prediction is averaged over the
+        qualities of the training links.
         """
         if not self.reads_quality:
             return self.held_out_mean_db, self.held_out_nll
@@ -356,7 +357,7 @@ class CrossFit:
 
     @cached_property
     def unforeseen(self) -> np.ndarray:
-        """(n,) bool, links affected by a fault that their fold's training links do not show.
+        """(n,) bool, links affected by a fault that no training link of their fold shows.
 
         A fault of one flight cannot be predicted from other flights, so such links are not scored.
         """
@@ -378,7 +379,7 @@ class CrossFit:
 
     @cached_property
     def held_out_shadowing(self) -> tuple[np.ndarray, np.ndarray]:
-        """(n,) interpolated shadowing [error scales], and (n,) factor left of the error scale."""
+        """(n,) held-out interpolated shadowing [error scales]; (n,) factor left of the scale."""
         shift, left = np.zeros(len(self.index)), np.ones(len(self.index))
         for number, fold in enumerate(self.folds):
             rows = np.flatnonzero(self.index == number)
@@ -390,8 +391,8 @@ class CrossFit:
 def match_effects(whole: Fit, fold: Fit) -> list[int | None]:
     """Find each effect of the fit to all links among the effects of a fold's fit.
 
-    Effects of one kind are matched by the overlap of the links they act on: one faulty flight is
-    not another. If the fold has as many of that kind, all are matched.
+    Effects of one kind are paired so that the links on which both act overlap most. Pairs without
+    a common link count only if both fits have equally many effects of that kind.
 
     Returns:
         for each effect of `whole`, its index in `fold.effects`; None if the fold lacks it.
@@ -422,7 +423,7 @@ def _rms(error: np.ndarray, rows: np.ndarray | None = None) -> float:
 
 
 def _with_quality(model: CrossFit, share: float) -> CrossFit:
-    """Give all held-out links one quality, a quantile of the training links'; refit nothing."""
+    """Set the quality of all held-out links to one quantile of that of training links; no refit."""
     def with_quantile(each: Fit) -> Fit:
         quality = each.links.quality
         assert quality is not None
@@ -450,7 +451,7 @@ def cross_validate(links: Links, base: Base, folds: Folds,
         links: n links.
         base: what to fit.
         folds: assignment of the links.
-        parts: `training_parts(links, folds)`, if bases share them.
+        parts: `training_parts(links, folds)`, if several bases share them; None: computed here.
 
     Raises:
         BadInput: too few usable links.
@@ -474,10 +475,10 @@ def cross_validate(links: Links, base: Base, folds: Folds,
 
 
 def best_base(models: dict[str, CrossFit]) -> str:
-    """Return the name of the base with the least held-out RMSE on links that all bases predict.
+    """Return the name of the base with the least held-out RMSE on the links that all bases predict.
 
-    So a base does not win by failing to locate difficult devices. If no link is predicted by all,
-    the base that predicts most links is returned.
+    So a base does not win by failing to locate difficult devices. If there is no such link, the
+    base that predicts most links is returned.
     """
     known = {name: np.isfinite(model.links.level_db - model.held_out_mean_db)
              for name, model in models.items()}
@@ -488,7 +489,7 @@ def best_base(models: dict[str, CrossFit]) -> str:
 
 
 def paths_gain_db(links: Links, scene: Scene, folds: Folds, seed: int) -> float:
-    """Return how much following paths reduces the held-out RMSE on a sample of anchors' links [dB].
+    """Return the held-out RMSE that following paths (reflections, …) saves on a sample [dB].
 
     Paths of all links take minutes to hours, and over maps with guessed building heights they
     explain no more than line of sight does.
@@ -500,7 +501,7 @@ def paths_gain_db(links: Links, scene: Scene, folds: Folds, seed: int) -> float:
         seed: random seed, see `make_bases`.
 
     Returns:
-        RMSE of the segmented law minus RMSE of paths; inf if the sample is too small.
+        RMSE of the segmented law minus RMSE with paths, on links of anchors; inf if too few.
     """
     known = np.isin(links.device, sorted(links.anchors)) & np.isfinite(links.level_db)
     rows = subsample(np.flatnonzero(known & (folds.index >= 0)), FIRST_LOOK_LINKS)
@@ -522,7 +523,7 @@ def paths_gain_db(links: Links, scene: Scene, folds: Folds, seed: int) -> float:
 
 
 def _with_evidence(links: Links, whole: Model) -> Links:
-    """Group links that err alike, by the base's residual, unless that was done already."""
+    """Group links with correlated residuals into pieces that count once, unless that was done."""
     if links.evidence is not None:
         return links
     view, z = whole.fit().view, np.full(len(links), np.nan)

@@ -72,9 +72,10 @@ class Readings:
 
     @property
     def step_db(self) -> np.ndarray:
-        """(n,) change of the residual since the previous reading, over √2 [dB]; NaN for the first.
+        """(n,) change of the residual since the previous reading of the same link, over √2 [dB].
 
-        It estimates the receiver's noise: errors of the map change slowly along a track.
+        It estimates the receiver's noise, since errors of the map change slowly along a track. NaN
+        for the first reading, and where line of sight changes.
         """
         before = self.previous
         alike = (before >= 0) & (self.los == self.los[before])
@@ -137,7 +138,11 @@ class Family:
 
 
 def units_of(readings: Readings) -> Units:
-    """Label readings with correlated errors: nearby in a flight; of a device in a wider square."""
+    """Label readings that share errors, by squares of ground around the moving end.
+
+    Errors of one pass are shared within `PASSING_M` in a flight; lasting ones, which are errors of
+    the map, by readings of one device within `LASTING_M`.
+    """
     passing, lasting = (_squares_of(readings.moving_m, width_m)
                         for width_m in (PASSING_M, LASTING_M))
     return Units(combined_labels(*passing.T, readings.flight),
@@ -165,7 +170,7 @@ def _renumber(label: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 def families_of(readings: Readings, units: Units) -> Iterator[Family]:
-    """Yield all families of groups.
+    """Yield all families: sets of groups that are compared with each other, e.g. all receivers.
 
     Args:
         readings: n readings.
@@ -193,7 +198,7 @@ def families_of(readings: Readings, units: Units) -> Iterator[Family]:
 
 def _pairs(readings: Readings, first: str, second: str,
            labels: Mapping[str, np.ndarray], units: Units) -> Iterator[Family]:
-    """Yield the pairs of two kinds of ends, unless each end of one kind has a single partner."""
+    """Yield pairs of two kinds of ends, unless each end of one kind occurs in a single pair."""
     one, other = labels[first], labels[second]
     code = combined_labels(one, other)
     count = int(code.max()) + 1
@@ -225,7 +230,11 @@ def _row_of_label(label: np.ndarray) -> np.ndarray:
 
 
 def _windows(readings: Readings, units: Units) -> Iterator[Family]:
-    """Yield windows of time within each flight, of all receivers together and of each."""
+    """Yield windows of time of each flight, for all its receivers together and for each receiver.
+
+    A flight is cut into 2, 4, … 32 equal windows, and again shifted by half a window. Nothing is
+    yielded if under half of the readings have a time.
+    """
     timed = np.isfinite(readings.time_s)
     if timed.mean() < 0.5:
         return
@@ -246,7 +255,7 @@ def _windows(readings: Readings, units: Units) -> Iterator[Family]:
 
 
 def _share_of_time(readings: Readings, label: np.ndarray) -> np.ndarray:
-    """Return elapsed time (n,) as a share in [0, 1) of the label's duration; 0 if unknown."""
+    """Return the time (n,) as a share, 0 to below 1, of the duration of its label; 0 if unknown."""
     begin_s, end_s = np.full(label.max() + 1, np.inf), np.full(label.max() + 1, -np.inf)
     known = np.isfinite(readings.time_s)
     np.minimum.at(begin_s, label[known], readings.time_s[known])
@@ -256,7 +265,7 @@ def _share_of_time(readings: Readings, label: np.ndarray) -> np.ndarray:
 
 
 def _describe_window(readings: Readings, scope: str, code: np.ndarray) -> Callable:
-    """Return the `describe` of windows of time with labels `code` (n,), by flight or receiver."""
+    """Return the function `Family.describe` for windows of time with labels `code` (n,)."""
     def describe(group: int) -> Description:
         rows = code == group
         flight = readings.flight[rows][0]
@@ -319,9 +328,10 @@ def _bands(readings: Readings, units: Units) -> Iterator[Family]:
 
 
 def _curves(readings: Readings, units: Units) -> Iterator[Family]:
-    """Yield curves: levels of each device, receiver or flight in bins along time, flight or angle.
+    """Yield curves: levels of each device, receiver or flight in bins along one variable.
 
-    There is no curve of a device's levels over direction: a wrong building nearby would change it.
+    The variable is time, flight, body azimuth or predicted level. There is no curve of a device
+    over direction, since a wrong building nearby would change it.
     """
     track, device, receiver = readings.track, readings.device, readings.receiver
     timed, predicted_db = np.isfinite(readings.time_s), readings.predicted_db
@@ -366,7 +376,7 @@ def _quantiles(values: np.ndarray, count: int) -> np.ndarray:
 
 
 def _places(readings: Readings, units: Units) -> Iterator[Family]:
-    """Yield ground squares in which links end, or which they cross below `LOW_M`."""
+    """Yield ground squares that hold the moving end of links, or that links cross below `LOW_M`."""
     share = (np.arange(RAY_SAMPLES) + 0.5) / RAY_SAMPLES
     along_m = readings.device_m[:, None] + share[:, None] * (
         readings.receiver_m - readings.device_m)[:, None]
@@ -383,11 +393,11 @@ def _places(readings: Readings, units: Units) -> Iterator[Family]:
 
 def _square_family(link: np.ndarray, cell: np.ndarray, width_m: float,
                    ends: tuple[np.ndarray, ...], units: Units) -> Family:
-    """Group links by the squares that they touch.
+    """Return the family of the links in, or across, each square of ground.
 
     Args:
-        link: (m,) link of each touch, which may repeat.
-        cell: (m, 2) indices of the square.
+        link: (m,) a link that is in a square; pairs of link and square may repeat.
+        cell: (m, 2) indices of that square.
         width_m: side of the squares [m].
         ends: labels whose mean levels are subtracted, see `Family.ends`.
         units: labels of readings with correlated errors.

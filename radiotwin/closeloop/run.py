@@ -103,9 +103,9 @@ class Loop(Summarised):
 
     @cached_property
     def for_twin(self) -> CrossFit:
-        """`after`, fitted again without descriptive effects that a map cannot show.
+        """`after`, fitted again without effects that only describe the residual and fit no map.
 
-        If there is no such effect, `after` itself with its interpolated shadowing.
+        If there is no such effect, `after` itself, with its interpolated shadowing.
         """
         dropped = [each.entry for each in self.after.whole.effects
                    if not (each.is_cause or each.is_declared or each.is_on_maps())]
@@ -188,7 +188,7 @@ class Loop(Summarised):
 
     @cached_property
     def detectable(self) -> list[Detectable]:
-        """Least size of each effect from which it would have been named."""
+        """Least size from which each effect would have been named; empty if none was tried."""
         if self.found.looked_at is None:
             return []
         model, hypotheses = self.found.looked_at

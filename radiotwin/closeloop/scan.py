@@ -146,7 +146,11 @@ def scan(model: CrossFit) -> list[Anomaly]:
 
 
 def scan_readings(readings: Readings) -> list[Anomaly]:
-    """Find groups of readings that stand out, see `scan`."""
+    """Find groups of readings that stand out from their peers, see `scan`.
+
+    One group is taken at a time: the one without whose deviation least remains unexplained. Its
+    deviation is subtracted from the residuals before the next round.
+    """
     units = units_of(readings)
     families = list(families_of(readings, units))
     end_families = [each for each in families
@@ -196,7 +200,11 @@ class _SightClass:
     less_ends: dict[tuple[int, ...], np.ndarray] = field(default_factory=dict)
 
     def comparable_values(self, family: Family, groups: Groups) -> np.ndarray:
-        """Return values (n,) minus the levels of a family's ends and of units its groups share."""
+        """Subtract from the values (n,) the levels of a family's ends, such as of each device.
+
+        If groups share devices and places (`is_crossing`), the lasting error of each place is
+        subtracted from levels, too.
+        """
         key = tuple(id(end) for end in family.ends)
         if key not in self.less_ends:
             values, ends = self.values.copy(), [end[self.rows] for end in family.ends]
@@ -212,7 +220,10 @@ class _SightClass:
         return values
 
     def compare(self, family: Family) -> PeerComparison | Curves | None:
-        """Return how far a family's groups are from their peers; None if under two are judged."""
+        """Return how far a family's groups deviate from their peers in this class of links.
+
+        None if fewer than two groups have enough links.
+        """
         groups = family.groups.restrict_to(self.rows)
         if not len(groups.row):
             return None
@@ -253,7 +264,11 @@ class _SightClass:
 
 
 def _classes(readings: Readings, units: Units) -> dict[str, dict[str, _SightClass]]:
-    """Return the values of each statistic by `los` and `nlos`, where there are enough links."""
+    """Return by statistic the values of LoS links (`los`) and of NLoS links (`nlos`).
+
+    `base` is the raw residual; `level` and `scatter` are relative to the usual error of such links.
+    A class with fewer than `MIN_LINKS` detected links is left out.
+    """
     usual_db = _usual_errors(readings)
     values = {"level": readings.residual_db - usual_db, "scatter": readings.residual_db - usual_db,
               "noise": readings.step_db, "blanks": readings.blank_excess,
@@ -273,7 +288,10 @@ def _classes(readings: Readings, units: Units) -> dict[str, dict[str, _SightClas
 
 
 def compare(readings: Readings, families: list[Family], units: Units) -> list[Compared]:
-    """Compare the groups of families with their peers, by each statistic in LoS, NLoS and all."""
+    """Return the log odds that each group of the families deviates from its peers.
+
+    Each statistic is compared among LoS links, NLoS links and both together (`all`).
+    """
     found, classes = [], _classes(readings, units)
     alike = Counter((family.name, family.curve is None) for family in families)
     for family in families:
@@ -313,7 +331,8 @@ def _together(parts: list[PeerComparison | Curves]) -> PeerComparison | Curves:
 def _usual_errors(readings: Readings) -> np.ndarray:
     """Return the median residual (n,) of links with like height, distance and line of sight [dB].
 
-    The bias of a base differs between streets and above roofs, which is no fault of a flight.
+    The bias of a base differs between streets and above roofs, which is no fault of a flight. It is
+    0 for links that are not detected, or whose median could be the fault of one receiver.
     """
     heard = np.isfinite(readings.residual_db)
     height = np.searchsorted(HEIGHTS_M, readings.moving_m[:, 2])
@@ -354,10 +373,11 @@ def _candidates(compared: list[Compared], first: list[Compared],
     """Return the most probable group of each family, at most `MAX_RIVALS`, most probable first.
 
     Args:
-        compared: comparison of what is left in the residuals.
+        compared: comparison of the residuals after the groups in `taken` were subtracted.
         first: comparison before any group was taken.
-        taken: groups that were taken. They are excluded, and so is a group that did not stand out
-            at first and is much smaller than the first one taken: that may be its remainder.
+        taken: groups found so far, which are excluded. Also excluded is a group that did not stand
+            out in `first` and deviates by less than `ECHO` of the first group found: it may be
+            what the subtraction of that group left over.
     """
     found, before = [], {table.key: table.log_odds for table in first}
     for table in compared:
@@ -391,7 +411,7 @@ def _rows(found: _Found, readings: Readings) -> np.ndarray:
 
 
 def _without_group(readings: Readings, found: _Found) -> Readings:
-    """Subtract a group's deviation from the residuals, or drop its blanks."""
+    """Subtract a group's deviation from its residuals; of blanks, set the excess to NaN."""
     rows = _rows(found, readings)
     if found.compared.statistic == "blanks":
         excess = readings.blank_excess.copy()
@@ -403,7 +423,7 @@ def _without_group(readings: Readings, found: _Found) -> Readings:
 
 
 def _without_curve(readings: Readings, found: _Found, distance: Curves) -> Readings:
-    """Subtract a fitted curve from the residuals of its links."""
+    """Subtract a group's fitted curve from its residuals, for LoS and NLoS links apart."""
     residual_db, groups = readings.residual_db.copy(), found.compared.family.groups
     for sight in distance.bins:
         level_db = np.zeros(len(readings))
@@ -414,13 +434,13 @@ def _without_curve(readings: Readings, found: _Found, distance: Curves) -> Readi
 
 
 def shift_group(readings: Readings, rows: np.ndarray, statistic: str, size: float) -> Readings:
-    """Add a size to the level [dB] of some readings, or scale their scatter by its exponential.
+    """Shift the level of some readings, or scale their scatter around the median.
 
     Args:
         readings: n readings.
-        rows: (n,) bool, which of them.
+        rows: (n,) bool, readings to change.
         statistic: `level`, or any other for the scatter.
-        size: dB; logarithm of the factor.
+        size: shift of the level [dB], or natural logarithm of the scatter's factor.
     """
     residual_db = readings.residual_db.copy()
     if statistic == "level":

@@ -66,7 +66,7 @@ def least_deviations(model: CrossFit) -> list[LeastDeviation]:
 
 
 def _typical_group(distance: PeerComparison) -> tuple[int, float]:
-    """Return the group with the median uncertainty (its error and peers' spread), and that."""
+    """Return the group with the median uncertainty (own error and peers' spread) and its value."""
     judged = np.isfinite(distance.size)
     sd = np.where(judged, np.hypot(distance.error, distance.spread), np.inf)
     group = int(np.argsort(sd)[(judged.sum() - 1) // 2])
@@ -75,7 +75,10 @@ def _typical_group(distance: PeerComparison) -> tuple[int, float]:
 
 def _least_size(compared: Compared, group: int, sd: float, readings: Readings,
                 units: Units) -> float:
-    """Move a group away from its peers until the scan surely finds it; return that size, or inf."""
+    """Return the size of a group's deviation from which the scan surely finds it; or inf.
+
+    The deviation added to its readings grows by `STEP` until the probability is `MIN_SURE`.
+    """
     statistic = compared.statistic
     family = replace(compared.family, statistics=(statistic,))
     rows, sure = family.groups.members(group, len(readings)), logit(MIN_SURE)

@@ -114,7 +114,7 @@ def _corrected_buildings(scene: Scene, shapes_of: dict[int, set[str]], left: set
     Args:
         scene: declared scene.
         shapes_of: names of the shapes in `city.xml`, by building.
-        left: shapes in the corrected scene.
+        left: names of the shapes in the corrected scene; rows of other shapes are dropped.
         roofs: roofs with corrected heights.
         base_m: (buildings,) height of the ground under each building [m].
     """
@@ -224,7 +224,7 @@ def write_corrected_scene(loop: Loop, scene: Scene, folder: Path) -> list[str]:
 
 def _moved(found: Sequence[Correction], links: Links, scene: Scene,
            city: CityMap | None) -> tuple[SceneConfig, list[str]]:
-    """Move anchors to the found position, or the nearest one outside buildings in `city`.
+    """Move anchors to their corrected positions, or the nearest ones outside buildings of `city`.
 
     Returns:
         the configuration, and a sentence for each anchor.
@@ -277,7 +277,10 @@ def _free_position(position_m: np.ndarray, device: DeviceConfig, scene: Scene,
 
 
 def _pulled_back(box: Box, points_m: np.ndarray) -> Box:
-    """Shrink a box until it contains no point (n, 3) [m], each time with least loss of volume."""
+    """Shrink a box until no point (n, 3) is within `CLEARANCE_M` of it [m].
+
+    For each point the side is moved that costs the least volume, never the bottom.
+    """
     axes = box.axes
     high = np.array([0.5 * box.length_m, 0.5 * box.width_m, box.height_m])
     low = np.array([-high[0], -high[1], 0.0])
@@ -297,10 +300,10 @@ def _pulled_back(box: Box, points_m: np.ndarray) -> Box:
 
 def _write_city(scene: Scene, folder: Path, keep: np.ndarray, boxes: list[Box],
                 roofs: list[Roof], base_m: np.ndarray) -> tuple[dict[int, set[str]], set[str]]:
-    """Write `city.xml` and `meshes/` with kept faces (f,), corrected roofs and added boxes.
+    """Write `city.xml` and `meshes/` with the faces `keep` (f,), corrected roofs and added boxes.
 
     Returns:
-        names of the shapes by building, before; names of the shapes that are left.
+        names of the declared shapes by building; names of those that still have a face.
     """
     label, shapes, first = buildings(scene.city)[0], [], 0
     shapes_of: dict[int, set[str]] = {}
@@ -341,7 +344,7 @@ def _with_roofs(mesh: trimesh.Trimesh, label: np.ndarray, roofs: list[Roof],
 
 
 def _box_shapes(scene: Scene, boxes: list[Box], taken: Names) -> list[CityShape]:
-    """Return shapes of boxes, from the map's lowest point up, with names that are not `taken`."""
+    """Return shapes of boxes, from the map's lowest point up; their names are not in `taken`."""
     name = taken.unique(f"found_{BOX_MATERIAL}")
     material = traceable(itu_material(BOX_MATERIAL, name=name), scene.config.radio.frequency_hz)
     bottom_m = min(float(scene.city.vertices[:, 2].min()), 0.0)

@@ -113,7 +113,7 @@ class Residuals(Summarised):
         return links_dataset(self.table, self.origin)
 
     def to_geodataframe(self) -> GeoDataFrame:
-        """Return the links with a point at the end that moves, in metres of the local frame.
+        """Return the table with a point for each link, at its moving end in the local frame [m].
 
         Raises:
             BadInput: GeoPandas is not installed.

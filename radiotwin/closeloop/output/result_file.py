@@ -48,7 +48,7 @@ NOT_KNOWN: dict[str, Any] = {"size_db": None, "uses": [], "is_declared": False, 
 
 def compare_with_baselines(error: dict[str, Any],
                            baselines: dict[str, dict[str, Any]]) -> dict[str, Any] | None:
-    """Compare the combination with the best baseline on the same links.
+    """Compare the combination (the weighted prediction of all models) with the best baseline.
 
     Args:
         error: scores of `combined` and `after`, each with `n` and `rmse_db`.
@@ -56,7 +56,7 @@ def compare_with_baselines(error: dict[str, Any],
 
     Returns:
         `best_baseline`, `best_baseline_rmse_db`, `combined_rmse_db`, and `advice`, a sentence;
-        None if no baseline predicts the same links.
+        None if no baseline predicts as many links.
     """
     rmse_db = {name: each["rmse_db"] for name, each in baselines.items()
                if each["n"] == error["combined"]["n"]}
@@ -152,12 +152,13 @@ def make_report(loop: Loop) -> dict[str, Any]:
 
 def consistent_sizes(found: Iterable[Detectable], named: Set[str],
              steps: Iterable[Step]) -> list[Detectable]:
-    """Drop least sizes that contradict the search.
+    """Drop least detectable sizes that contradict the search.
 
-    Dropped are those of named effects, and infinite ones of effects that were probable in any step.
+    Dropped are those of named effects, and infinite ones of effects that any step of the search
+    gave a probability of at least `LIKELY`.
 
     Args:
-        found: least size of each effect.
+        found: least size from which each effect would have been named.
         named: names of the effects found.
         steps: summaries of the search with probabilities.
     """
@@ -168,7 +169,7 @@ def consistent_sizes(found: Iterable[Detectable], named: Set[str],
 
 
 def scores(model: CrossFit, rows: np.ndarray | None = None) -> dict[str, float]:
-    """Return a model's held-out errors, predicted as by a map, on a mask (n,) of links or all.
+    """Return the held-out errors of a model used as a map, on a mask (n,) of links (None: all).
 
     Returns:
         those of `errors`, and `nll`, mean negative log-likelihood of detected and blank links
@@ -255,7 +256,7 @@ def _places(effect: Effect, parameters: Iterable[str], links: Links) -> list[dic
 
 
 def _step(step: Step) -> dict[str, Any]:
-    """Return a `StepRecord`, the most probable effect first."""
+    """Return the `StepRecord` of a step for `closeloop.json`, the most probable effect first."""
     ordered = sorted(step.probabilities.items(), key=lambda item: -item[1])
     return {"step": step.number + 1, "unnamed_nats": step.unnamed_nats, "rest_db": step.rest_db,
             "noise_db": step.noise_db,
@@ -263,7 +264,7 @@ def _step(step: Step) -> dict[str, Any]:
 
 
 def _anomaly(found: Anomaly) -> dict[str, Any]:
-    """Return an `AnomalyRecord` without `same_over`."""
+    """Return the `AnomalyRecord` of an anomaly for `closeloop.json`, without `same_over`."""
     return {"family": found.family, "members": {key: list(names) for key, names in
                                                 found.members.items()},
             "ranges": {key: list(ends) for key, ends in found.ranges.items()},
@@ -275,12 +276,13 @@ def _anomaly(found: Anomaly) -> dict[str, Any]:
 
 
 def same_over(found: Anomaly, base: CrossFit) -> list[str]:
-    """Return whether a group's level deviates alike in every `flight` and every `direction`.
+    """Return over which of `flight` and `direction` a device or receiver deviates equally.
 
-    Each flight (or octant) must deviate from the peers by at least half of the anomaly's size.
+    In every flight (or octant) of the group, the level must deviate from the other links by at
+    least half of the anomaly's size.
 
     Returns:
-        the names that hold; empty for groups other than devices and receivers with another level.
+        `flight`, `direction`, both or neither; empty for other groups and other statistics.
     """
     links = base.links
     if found.statistic != "level" or found.family not in ("device", "receiver"):
@@ -302,7 +304,10 @@ def same_over(found: Anomaly, base: CrossFit) -> list[str]:
 
 
 def explained_anomalies(loop: Loop) -> list[list[int]]:
-    """Return for each effect the indices of the anomalies of which it explains at least half."""
+    """Return for each cause found the indices of the anomalies that it explains at least by half.
+
+    The list is empty for descriptive and declared effects.
+    """
     whole, found = loop.after.whole, []
     if not loop.found.anomalies:
         return [[] for _ in whole.effects]
@@ -321,7 +326,7 @@ def _explained_share(anomaly: Anomaly, residual_db: np.ndarray, change_db: np.nd
                      scatter_sd_db: np.ndarray | None) -> float:
     """Return the share of an anomaly that an effect explains; about 1 = all.
 
-    A level is compared with the effect's change of the group against its peers. A scatter or curve
+    For a level, this is the effect's change of the group relative to its peers. A scatter or curve
     is explained as far as the residual's spread shrinks when the change is subtracted.
 
     Args:
@@ -348,7 +353,7 @@ def _explained_share(anomaly: Anomaly, residual_db: np.ndarray, change_db: np.nd
 
 
 def _difference(found: ReceiverDifference, links: Links) -> dict[str, Any]:
-    """Return a `ReceiverDifferenceRecord`."""
+    """Return the `ReceiverDifferenceRecord` of two receivers' mean difference of level [dB]."""
     value = Parameter(found.difference_db, found.low_db, found.high_db, "dB")
     return {"first": links.receiver_names[found.first],
             "second": links.receiver_names[found.second], "difference_db": value.record(),
@@ -374,7 +379,7 @@ def _shadowing(trial: Trial, model: CrossFit, rank: int) -> dict[str, Any]:
 
 
 def _groups(links: Links) -> dict[str, dict[str, np.ndarray]]:
-    """Return masks (n,) of links by line of sight, device, receiver and flight, by their names."""
+    """Return masks (n,) of links by line of sight, device, … (if at most `MAX_GROUPS`), by name."""
     groups = {"los": {"los": links.los, "nlos": ~links.los}}
     for name, index, labels in (("device", links.device, links.device_names),
                                 ("receiver", links.receiver, links.receiver_names),
@@ -386,7 +391,7 @@ def _groups(links: Links) -> dict[str, dict[str, np.ndarray]]:
 
 
 def _for_json(value: Any) -> Any:
-    """Convert NaN to None and NumPy numbers to Python's, also within dicts and lists."""
+    """Convert NaN and inf to None and NumPy numbers to Python's, also within dicts and lists."""
     if isinstance(value, dict):
         return {name: _for_json(each) for name, each in value.items()}
     if isinstance(value, list | tuple):

@@ -87,6 +87,7 @@ def combined_prediction(model: CrossFit, with_rest: bool, seed: int) -> Combined
     """Predict held-out links by a weighted combination of models.
 
     Members: base with effects, trees on its residual and on levels, interpolated shadowing, laws.
+    The weights for a fold are fitted to the links of the other folds.
 
     Args:
         model: cross-validated fit with all named effects.
@@ -142,15 +143,15 @@ def combined_fit(model: CrossFit, found: Combination, seed: int) -> FittedModel:
 def _learn(fit: Fit, part: Part, names: Collection[str], seed: int, trees: int = TREES,
            rest: CorrelatedShadowing | None = None,
            laws: dict[str, ChannelModel] | None = None) -> FittedModel:
-    """Learn the members of a combination from the training links of a fit, with equal weights.
+    """Learn the members of a combination (effects, trees, laws, …), all with equal weights.
 
     Args:
-        fit: fit to some of n links.
-        part: the n links with features.
+        fit: fit to the training links among n links.
+        part: the n links with the features of trees.
         names: names of the members.
         seed: random seed of trees and samples.
         trees: number of trees.
-        rest: interpolated shadowing; None: it is fitted if it is a member.
+        rest: interpolated residual (shadowing); None: it is fitted if it is a member.
         laws: laws that were fitted already, by name.
     """
     if REST in names:
@@ -171,7 +172,7 @@ def _learn(fit: Fit, part: Part, names: Collection[str], seed: int, trees: int =
 
 
 def _combined(learnt: FittedModel, fit: Fit, found: Combination) -> FittedModel:
-    """Set the weights of a combination, and drop members without a weight."""
+    """Return a learnt model with the weights of a combination; members without one are dropped."""
     assert learnt.blend is not None
     blend = learnt.blend.weighted(found.weights, found.half_m, found.sd_ratio)
     shadowing = learnt.shadowing if REST in found.weights else fit.shadowing
@@ -192,7 +193,7 @@ def _held_out(learnt: FittedModel, fit: Fit, test: np.ndarray, fold: np.ndarray)
 
 def _hold_out_quadrants(model: CrossFit, learnt: FittedModel, part: Part, names: list[str],
                         seed: int) -> HeldOut:
-    """Hold out each quadrant of the last fold's training links, refit, and predict it.
+    """Predict each quadrant of the last fold's training links by members learnt in the other three.
 
     Refitted are coefficients, trees and interpolated values. A few searched parameters, such as the
     position of a box or a correlation length, are kept from the fit to all training links.
@@ -229,10 +230,10 @@ def _quadrant(links: Links) -> np.ndarray:
 
 def grow_forests(fit: Fit, part: Part, seed: int, names: Collection[str],
                   trees: int = TREES) -> dict[str, Forest]:
-    """Grow trees on training links: on the standardised residual (`FORESTS`) and on the levels.
+    """Grow trees on training links: for the standardised residual (`FORESTS`) and for the level.
 
-    A blank counts as the predicted mean below the limit. The receiver is no feature, since a map
-    is for a faultless receiver.
+    For a blank link, its expected value below the limit of detection is used. The receiver is no
+    feature, since a map is for a faultless receiver.
 
     Args:
         fit: fit to some of n links.

@@ -126,7 +126,11 @@ def combination(held_out: HeldOut, away: HeldOut, names: list[str], half_m: floa
 
 def _weights(held_out: HeldOut, away: HeldOut, half_m: float, sd_ratio: tuple[float, float],
              dof: float) -> np.ndarray:
-    """Fit weights (2, k), near and far; members below `MIN_WEIGHT` get 0."""
+    """Fit weights (2, k) of k members, near and far, by least squared error of readings.
+
+    Quadrants (`away`) count less, until every fold is predicted nearly as well (`AS_GOOD`) as by
+    the best member; otherwise this member gets all weight. Weights below `MIN_WEIGHT` become 0.
+    """
     sets = []
     for links in (held_out, away):
         links = links.select(np.isfinite(links.level_db))
@@ -140,7 +144,7 @@ def _weights(held_out: HeldOut, away: HeldOut, half_m: float, sd_ratio: tuple[fl
     (error, share, fold), (error_away, share_away, fold_away) = sets
 
     def fitted(count: float, left_out: int = -1) -> np.ndarray:
-        """Return weights with a weight of the quadrants, without the links of one fold."""
+        """Return weights if quadrants count `count` times; the fold `left_out` is not used."""
         near, far = fold != left_out, fold_away != left_out
         # Scale errors so that both sets count by their mean square, not by their number of links.
         factor = np.sqrt(count * near.sum() / max(far.sum(), 1))
@@ -163,9 +167,9 @@ def _weights(held_out: HeldOut, away: HeldOut, half_m: float, sd_ratio: tuple[fl
 
 def _sd_ratio(held_out: HeldOut, away: HeldOut, weights: np.ndarray, half_m: float,
               dof: float) -> tuple[float, float]:
-    """Fit the ratio of the error scale to that of the members, near and far, by likelihood.
+    """Fit the error scale of the combination over that of its members, near and far, by likelihood.
 
-    Both sets are used, since errors far from measurements show only in held-out quadrants.
+    Quadrants (`away`) are used, too, as errors far from measurements show only in them.
     """
     links = HeldOut.join([held_out, away])
     links = links.select(np.arange(0, len(links), max(len(links) // SD_LINKS, 1)))

@@ -34,14 +34,18 @@ ANOTHER = "another"  # name of a cause that is not in the catalogue
 
 
 def add_causes_of_anomalies(state: SearchState, inputs: SearchInputs) -> SearchState:
-    """Search for the causes of anomalies with a probability of at least `MIN_SURE`."""
+    """Search for the cause of each anomaly that is real with a probability of at least `MIN_SURE`.
+
+    After a cause was added to the model, the residual is scanned again. Anomalies that are gone
+    from it get the causes found last; only those that remain are searched for.
+    """
     explained: list[Anomaly] = []
     remaining, latest = list(state.anomalies), None
     for anomaly in state.anomalies:
         if anomaly.probability >= MIN_SURE and not state.is_full(inputs.criteria):
             if latest is not None and not any(
                     each.rows[anomaly.rows].mean() >= MIN_SHARED for each in remaining):
-                anomaly = replace(anomaly, causes=latest)  # gone with the cause named last
+                anomaly = replace(anomaly, causes=latest)  # that cause removed it
             else:
                 before = state.model
                 state, causes = _with_cause(state, anomaly, inputs)
@@ -54,10 +58,13 @@ def add_causes_of_anomalies(state: SearchState, inputs: SearchInputs) -> SearchS
 
 def _with_cause(state: SearchState, anomaly: Anomaly, inputs: SearchInputs
                 ) -> tuple[SearchState, dict[str, float]]:
-    """Search for the cause of an anomaly.
+    """Search for the cause of an anomaly, a group of links that reads otherwise than its peers.
+
+    The effects that can act on such a group are fitted to it and compared by their evidence. The
+    likeliest is named if it reaches `min_probability` and passes on held-out links, else the next.
 
     Returns:
-        the state, with an effect more if a cause is named; the probability of each cause by name.
+        the state, with one more effect if a cause is named; the probability of each cause by name.
     """
     model, criteria = state.model, inputs.criteria
     ends = [name for names in anomaly.members.values() for name in names]
@@ -68,8 +75,8 @@ def _with_cause(state: SearchState, anomaly: Anomaly, inputs: SearchInputs
         return state, {}
     candidates: list[Candidate] = []
     for effect in _acting_on(anomaly, model, inputs):
-        # Following paths takes longest, so effects that gain little with fast levels are fitted
-        # without.
+        # Following paths takes longest, so it is left out for effects that gain little by the
+        # quick law.
         best_nats = max((each.gain_nats for each in candidates), default=0.0)
         fitted = fit_candidate(model, effect, criteria, hypotheses, group,
                                MIN_RIVAL_SHARE * best_nats)
@@ -93,7 +100,10 @@ def _with_cause(state: SearchState, anomaly: Anomaly, inputs: SearchInputs
 
 
 def _cause_probabilities(candidates: Sequence[Candidate], another_nats: float) -> dict[str, float]:
-    """Return the probability of each cause and of `ANOTHER` by their evidence, highest first."""
+    """Return the probability of each cause and of `ANOTHER`, an unnamed one, highest first.
+
+    They follow from the evidence [nats] with equal prior odds; variants of one effect are summed.
+    """
     names = [*(each.effect.name for each in candidates), ANOTHER]
     nats = [*(each.evidence_nats for each in candidates), another_nats]
     causes: dict[str, float] = {}
@@ -112,8 +122,8 @@ def _judge_cause(model: CrossFit, candidate: Candidate, others: Sequence[float],
             hypotheses: Hypotheses, inputs: SearchInputs) -> tuple[Trial, CrossFit | None]:
     """Score a cause on held-out links and compute its probability, as `score_and_judge`.
 
-    A fault of one flight, or a change between two, cannot be learnt from other flights. It is
-    scored in folds that leave part of each flight.
+    A fault of one flight, or a change between two, cannot be learnt from other flights. So it is
+    scored in folds that hold out a part of every flight.
     """
     effect = candidate.effect
     changes = inputs.folds.by == "flight" and effect.between_flights() is not None

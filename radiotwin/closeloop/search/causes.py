@@ -59,7 +59,7 @@ class Tried:
 
 
 def add_causes(state: SearchState, inputs: SearchInputs) -> SearchState:
-    """Add lasting causes, the most evident first, until none passes."""
+    """Add causes that act in all flights, the most evident first, until none passes."""
     return forward_selection(state, [effect for effect in inputs.undeclared
                                      if not (effect.within_flights or effect.of_groups)], inputs)
 
@@ -70,7 +70,7 @@ def forward_selection(state: SearchState, effects: Sequence[Effect],
 
     Args:
         state: state of the search.
-        effects: candidates: causes, or trends, which have no probability.
+        effects: candidates: all causes, or all trends (curves), which need no probability.
         inputs: inputs of the search.
     """
     if not effects:
@@ -90,7 +90,10 @@ def forward_selection(state: SearchState, effects: Sequence[Effect],
 
 def _one_step(state: SearchState, available: list[Effect], causes: bool,
               inputs: SearchInputs) -> SearchState:
-    """Run one step: keep the best candidate (or several), or leave the model if none passes."""
+    """Try all available effects, and add the best one that passes, or a set that is probable.
+
+    If none passes, the model stays. Only `causes` have a probability, trends need a held-out gain.
+    """
     hypotheses = None
     if causes:
         inputs.on_progress(f"step {state.step + 1}: what the base may be wrong in")
@@ -100,7 +103,7 @@ def _one_step(state: SearchState, available: list[Effect], causes: bool,
         state, tried = _judge_step(state, tried, hypotheses, inputs.criteria)
         waiting = [each.waiting for each in tried if each.waiting is not None]
         if waiting and not _passed(tried):
-            # The candidates with the largest gain are improbable; a weaker one may be probable.
+            # The candidates scored so far are improbable, so score the weaker ones after all.
             scored = _score(state, waiting, inputs)
             tried = [*(each for each in tried if each.waiting is None), *scored]
             state, tried = _judge_step(state, tried, hypotheses, inputs.criteria)
@@ -121,7 +124,11 @@ def _passed(tried: list[Tried]) -> list[Tried]:
 
 def _try_all(state: SearchState, available: list[Effect], hypotheses: Hypotheses | None,
              inputs: SearchInputs) -> list[Tried]:
-    """Fit every available effect, and score it on held-out links unless a better one passed."""
+    """Fit every available effect to all links, and score it on held-out links.
+
+    Not scored are effects that cannot be fitted plausibly, and effects whose training gain is far
+    below the held-out gain of one that passed (`_clearly_better`).
+    """
     model, step = state.model, state.step
     found = [each.entry for each in model.whole.effects]
     effects = [effect for effect in available
@@ -146,7 +153,7 @@ def _score(state: SearchState, candidates: list[Candidate], inputs: SearchInputs
         state: state of the search.
         candidates: effects fitted to all links.
         inputs: inputs of the search.
-        is_needless: returns whether one that passed makes scoring another needless.
+        is_needless: returns whether an effect that passed makes scoring a candidate needless.
     """
     model, step = state.model, state.step
     tried: list[Tried] = []
@@ -169,10 +176,13 @@ def _score(state: SearchState, candidates: list[Candidate], inputs: SearchInputs
 
 def _judge_step(state: SearchState, tried: list[Tried], hypotheses: Hypotheses,
                 criteria: SelectionCriteria) -> tuple[SearchState, list[Tried]]:
-    """Compute the probabilities of a step's candidates, and add the step's summary to the state.
+    """Compute the probabilities of a step's candidates, and refuse those that are too improbable.
 
-    Trials of earlier stages beside the same model are judged again, as rivals. A probable candidate
-    is refused if its size on held-out links may be 0.
+    A probable candidate is refused, too, if its size on held-out links may be 0. Trials that
+    earlier stages made with the same model compete as rivals and get new probabilities.
+
+    Returns:
+        the state with a summary of the step, and the candidates with their new trials.
     """
     step, earlier = state.step, state.log.of_step(state.step)
     judged, summary = judge([*earlier, *(each.trial for each in tried)], state.model, hypotheses,
@@ -196,7 +206,10 @@ def _all_confirmed(model: CrossFit, last: int) -> bool:
 
 def _probable_together(state: SearchState, supported: Sequence[Tried],
                       inputs: SearchInputs) -> list[Tried]:
-    """Search for a set of effects that are probable together, though none is by itself.
+    """Search for a set of effects that is probable, though none of them is probable by itself.
+
+    The most probable effect is extended by a second one, then by repeats of itself while they make
+    the set more probable.
 
     Args:
         state: state of the search, with the step's summary.
@@ -214,7 +227,7 @@ def _probable_together(state: SearchState, supported: Sequence[Tried],
     inputs.on_progress(f"step {step.number + 1}: {first.trial.name}, beside another effect")
 
     def beside(found: list[Tried], effects: list[Effect]) -> list[list[Tried]]:
-        """Return a set of effects extended by one, for each effect that passes beside them."""
+        """Return the set `found` plus one effect, for each of `effects` that passes with it."""
         model = found[-1].model
         if len(model.whole.effects) >= criteria.max_effects:
             return []
@@ -247,7 +260,7 @@ def _probable_together(state: SearchState, supported: Sequence[Tried],
 
 
 def _keep_together(state: SearchState, tried: list[Tried], found: list[Tried]) -> SearchState:
-    """Add effects that are probable together; the first of them is a candidate of the step."""
+    """Add a set of effects from `_probable_together`, and log the trials of the step (`tried`)."""
     first = found[0]
     log = state.log.record(
         *(first.trial.keep() if each.effect is first.effect else each.trial for each in tried),
@@ -257,14 +270,14 @@ def _keep_together(state: SearchState, tried: list[Tried], found: list[Tried]) -
 
 def _keep_best(state: SearchState, tried: list[Tried], hypotheses: Hypotheses | None,
                inputs: SearchInputs) -> SearchState:
-    """Add the best candidate that passed, or repeats of another one that explain more together.
+    """Add the candidate with the most evidence, or repeats of a weaker one that explain more.
 
-    Repeats (groves, towers) of a candidate are also tried if it passed on held-out links and was
-    refused only because it is improbable beside the best one.
+    Repeats (groves, towers) are tried of the best other candidate that passed, or of one that was
+    refused only as too improbable, with at least `MIN_RIVAL_SHARE` of the best evidence.
     """
     criteria, step = inputs.criteria, state.step
     passed = sorted(_passed(tried), key=lambda each: -each.trial.nats)
-    # Of indistinguishable candidates the one with the least held-out error is best.
+    # Among candidates that the evidence cannot tell apart, the least held-out RMSE comes first.
     max_nats = passed[0].trial.nats
     close = [each for each in passed
              if max_nats - each.trial.nats < criteria.indistinguishable_nats]
@@ -299,7 +312,7 @@ def _keep_best(state: SearchState, tried: list[Tried], hypotheses: Hypotheses | 
 
 def _if_more_probable(state: SearchState, repeats: list[Tried], best: Trial,
                       criteria: SelectionCriteria) -> list[Tried]:
-    """Return repeats with their joint probability, or [] if the best effect is more probable."""
+    """Return repeats with their joint probability; [] if it is too low or below that of `best`."""
     step = state.steps[-1]
     probability = probability_of_all([each.trial for each in repeats], best.nats, state.model,
                                      step.rest_db / step.noise_db)
@@ -311,10 +324,11 @@ def _if_more_probable(state: SearchState, repeats: list[Tried], best: Trial,
 
 def _clearly_better(passed: Tried, candidate: Candidate, model: CrossFit,
                     criteria: SelectionCriteria) -> bool:
-    """Return whether an effect that passed gains so much that a candidate need not be scored.
+    """Return whether a candidate need not be scored, since an effect that passed gains far more.
 
-    A candidate hardly gains more on held-out links than on training links. It is scored all the
-    same if it has more evidence, or if it alone is repeatable.
+    A candidate hardly gains more on held-out links than on training links, so its training gain is
+    compared with the held-out gain of the effect. A candidate with more evidence, or one that is
+    repeatable while the effect is not, is scored in any case.
     """
     lead_nats = passed.trial.nll_gain - candidate.gain_nats
     clear = lead_nats > criteria.indistinguishable_nats * model.whole.view.design_effect
@@ -324,7 +338,7 @@ def _clearly_better(passed: Tried, candidate: Candidate, model: CrossFit,
 
 
 def _devices_on_one_mast(model: CrossFit) -> int:
-    """Return the number of devices the last effect acts on if they share one mast; else 0."""
+    """Return the number of devices on which the last effect acts; 0 if not all are on one mast."""
     links = model.links
     devices = np.unique(links.device[model.whole.model.terms[-1].acts])
     on_mast = len(devices) and set(devices) <= set(site_of(links, devices[0]))
@@ -333,10 +347,14 @@ def _devices_on_one_mast(model: CrossFit) -> int:
 
 def _repeat(rival: Tried, hypotheses: Hypotheses | None, min_nats: float, max_repeats: int,
             inputs: SearchInputs) -> list[Tried]:
-    """Repeat an effect until all repeats together explain more than `min_nats`; return [] if never.
+    """Add an effect of one kind again until all repeats together have more than `min_nats`.
 
     Examples: groves, each seen from few devices, instead of an offset of each device; antennas
     instead of another position of their mast.
+
+    Returns:
+        the repeats, `rival` first; [] if a further one does not pass on held-out links, if the
+        limits of their number are reached, or if held-out links do not confirm each of them.
     """
     found, model = [rival], rival.model
     while len(model.whole.effects) < inputs.criteria.max_effects and len(found) < max_repeats:
@@ -353,9 +371,10 @@ def _repeat(rival: Tried, hypotheses: Hypotheses | None, min_nats: float, max_re
 
 
 def _without_kept_rivals(log: TrialLog) -> TrialLog:
-    """Remove from the rivals of kept effects those that were kept beside it or are still open.
+    """Remove from the rivals of each kept effect the names that turned out to be separate effects.
 
-    A rival that gains beside the effect is a separate effect, not another name for it.
+    A rival is an effect that the data could not tell from the kept one. It is separate if it was
+    kept as well, or if the last step did not refuse it: it gains in addition to the kept one.
     """
     last = max((each.step for each in log.trials), default=0)
     separate = {each.name for each in log.trials
@@ -365,15 +384,16 @@ def _without_kept_rivals(log: TrialLog) -> TrialLog:
 
 
 def _refit_exactly(model: CrossFit) -> CrossFit:
-    """Refit a model with exact levels if they explain its links better, and move limits."""
+    """Refit a model with levels along exact paths where they fit better, and move limits."""
     return _with_moved_limits(model.map(with_exact_levels))
 
 
 def _with_moved_limits(model: CrossFit) -> CrossFit:
-    """Move receivers' limits of detection by the reading offsets of the last effect.
+    """Move receivers' limits of detection by the reading offsets of the last effect, and refit.
 
-    A calibration offset shifts a receiver's readings and its apparent limit by as much. If both
-    agree within `SAME_DB`, they are one fault.
+    A calibration offset shifts a receiver's readings and its apparent limit by as much. A limit is
+    moved if its apparent shift agrees with the offset within `SAME_DB`. Without such an offset the
+    model is returned as it is.
     """
     whole = model.whole
     offsets_db = whole.effects[-1].reading_offsets_db(whole.coefficients_of(-1))

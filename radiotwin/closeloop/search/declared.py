@@ -8,10 +8,10 @@ from radiotwin.effects.base import Effect
 
 
 def add_declared(state: SearchState, inputs: SearchInputs) -> SearchState:
-    """Add declared effects, such as sector antennas of a table, if held-out links support them.
+    """Add effects that the tables declare, such as sector antennas, if held-out links support them.
 
-    A declared effect needs no probability, but the held-out likelihood must increase. One that the
-    readings contradict is left out, with a note.
+    The held-out likelihood must increase; no probability is needed. An effect that the readings
+    contradict is left out, with a note. If an effect has several variants, the best one is added.
     """
     declared = [effect for effect in inputs.effects if effect.is_declared]
     for name in dict.fromkeys(effect.name for effect in declared):
@@ -22,7 +22,7 @@ def add_declared(state: SearchState, inputs: SearchInputs) -> SearchState:
 
 
 def _with_best(state: SearchState, forms: list[Effect], inputs: SearchInputs) -> SearchState:
-    """Add the form of one declared effect with the largest held-out gain, if it passes."""
+    """Try the variants (`forms`) of one declared effect; add that of most held-out gain, if any."""
     before = state.model
     tried, passed = [], []
     for effect in forms:

@@ -43,7 +43,10 @@ from radiotwin.twin.model.model import Fit, Model
 
 
 def add_changes(state: SearchState, inputs: SearchInputs) -> SearchState:
-    """Add changes between flights one by one, if folds are flights, until none passes."""
+    """Add changes of receivers, then of devices, between flights one by one, until none passes.
+
+    Only if whole flights are held out, so that training links may lack such a change.
+    """
     changes = [each for effect in inputs.effects if (each := effect.between_flights()) is not None]
     for effect in sorted(changes, key=lambda each: not each.of_receiver):  # receivers first
         if inputs.folds.by == "flight" and not effect.unavailable(inputs.links):
@@ -52,7 +55,10 @@ def add_changes(state: SearchState, inputs: SearchInputs) -> SearchState:
 
 
 def _add_changes_of(state: SearchState, effect: Effect, inputs: SearchInputs) -> SearchState:
-    """Add changes of one effect (of receivers, or of devices), until none passes."""
+    """Add changes between flights by one effect, one after the other, until none passes.
+
+    They are scored on blocks of ground that are held out in all flights.
+    """
     model = None
     while not state.is_full(inputs.criteria):
         state, hypotheses = state.look(inputs.seed)
@@ -74,14 +80,21 @@ def _add_changes_of(state: SearchState, effect: Effect, inputs: SearchInputs) ->
 def judge_in_other_folds(model: CrossFit, candidate: Candidate, others: Sequence[float],
                      hypotheses: Hypotheses, inputs: SearchInputs
                      ) -> tuple[Trial, CrossFit | None]:
-    """Score a candidate, fitted in the search's folds, on a model with other folds."""
+    """Score a candidate by other folds than those of the search, such as parts of flights.
+
+    `model` has these folds. The candidate's parameters were fitted to all links, and are kept.
+    """
     found = candidate.whole.effects[-1]
     whole = model.whole.with_effects([*model.whole.effects, found])
     return score_and_judge(model, replace(candidate, whole=whole), others, hypotheses, inputs)
 
 
 def add_faults(state: SearchState, inputs: SearchInputs) -> SearchState:
-    """Add faults within flights one by one, until none passes."""
+    """Add faults that act at certain times of a flight one by one, until none passes.
+
+    They are scored in folds that hold out a part of every flight (`within_flights`). In each round
+    the candidates are tried by their training gain, and the first one that passes is added.
+    """
     timed = [effect for effect in inputs.undeclared
              if effect.within_flights and not effect.unavailable(state.model.links)]
     criteria, model = inputs.criteria, None
@@ -109,9 +122,10 @@ def add_faults(state: SearchState, inputs: SearchInputs) -> SearchState:
 
 def _refuse_lasting(faults: list[Candidate | Trial], state: SearchState,
                     inputs: SearchInputs) -> list[Candidate | Trial]:
-    """Refuse faults if a lasting effect on the same links explains as much.
+    """Replace faults by refused trials if a lasting effect on the same links explains as much.
 
-    A receiver that changed for good also looks faulty in each window of time afterwards.
+    A receiver that changed for good also looks faulty in each window of time afterwards. Only
+    effects that the faults name as `confused_with` are fitted as rivals.
     """
     rivals = {name for each in faults if isinstance(each, Candidate)
               for name in each.effect.confused_with}
@@ -125,7 +139,11 @@ def _refuse_lasting(faults: list[Candidate | Trial], state: SearchState,
 
 def _refuse_if_lasting(fault: Candidate, lasting: list[Candidate],
                        step: int) -> Candidate | Trial:
-    """Return a fault, or a refused trial if one of the lasting effects explains as much."""
+    """Return a fault, or a refused trial if one of the lasting effects explains as much.
+
+    That effect can be confused with the fault, gains at least as much on the training links, and
+    acts on at least the share `MIN_SHARED` of the fault's links.
+    """
     faulty = _affected_links(fault)
     rival = next((each for each in lasting if each.effect.name in fault.effect.confused_with
                   and each.gain_nats >= fault.gain_nats
@@ -144,10 +162,11 @@ def _affected_links(candidate: Candidate) -> np.ndarray:
 
 
 def drop_idle_faults(state: SearchState, inputs: SearchInputs) -> SearchState:
-    """Remove faults and changes that effects found later explain, such as an emitter an episode.
+    """Remove faults, and changes between flights, that effects found later explain.
 
-    One is removed if it gains less than `min_training_gain_nats` beside the later effects, or if
-    its search does not find it again.
+    Example: an emitter explains what looked like an episode of a receiver. A fault is removed if,
+    with the later effects in the model, it gains less than `min_training_gain_nats`, or if its
+    search does not find it again and it is not the likeliest cause of an anomaly.
     """
     for number in reversed(range(state.step)):
         model, whole = state.model, state.model.whole
@@ -169,7 +188,7 @@ def drop_idle_faults(state: SearchState, inputs: SearchInputs) -> SearchState:
 
 
 def _is_cause_of_anomaly(state: SearchState, number: int) -> bool:
-    """Return whether an effect is the likeliest cause of an anomaly whose links it acts on."""
+    """Return whether an effect (index) is the likeliest cause of an anomaly of links it acts on."""
     effect, acts = state.model.whole.effects[number], state.model.whole.model.terms[number].acts
     return any(max(each.causes, key=lambda name: each.causes[name]) == effect.name
                and acts[each.rows].mean() >= MIN_SHARED
@@ -177,9 +196,10 @@ def _is_cause_of_anomaly(state: SearchState, number: int) -> bool:
 
 
 def _is_found(fit: Fit, number: int, without: Fit) -> bool:
-    """Return whether a fault's search finds it in the residual of a fit without it.
+    """Return whether the search for an effect finds it again in a fit without it (`without`).
 
-    Always true for changes between flights, which have no such search.
+    A proposal is the same fault if at least the share `MIN_SHARED` of all links on which either
+    acts is common to both. Always true for changes between flights, which have no such search.
     """
     effect, acts, model = fit.effects[number], fit.model.terms[number].acts, without.model
     if not effect.within_flights:
@@ -196,14 +216,16 @@ def _without(model: Model, number: int | None) -> Model:
 
 
 def within_flights(model: CrossFit, inputs: SearchInputs, by: str = "") -> CrossFit:
-    """Refit a model with the same effects in folds that leave part of each flight.
+    """Cross-validate a model again, with the same effects, holding out a part of every flight.
 
-    Devices located by the base count as anchors.
+    So the training links show a fault of one flight. Devices that the base located count as
+    anchors, so that they can be held out.
 
     Args:
         model: cross-validated fit.
         inputs: inputs of the search.
-        by: what is held out; "": devices if there are enough anchors, else blocks.
+        by: what is held out; "": devices if at least `MIN_HELD_OUT_DEVICES` are anchors and fixed,
+            else blocks of ground.
     """
     device_m = inputs.base.device_m(model.twin)
     located = np.isfinite(device_m).all(axis=1)
@@ -220,7 +242,7 @@ def within_flights(model: CrossFit, inputs: SearchInputs, by: str = "") -> Cross
 
 
 def with_fault(model: CrossFit, candidate: Candidate) -> CrossFit:
-    """Add a fault to a model, and to each fold whose own training links show it."""
+    """Add a fault to the fit to all links, and to each fold whose own training links show it."""
     found = candidate.whole.effects[-1]
 
     def extend(fold: Fit) -> Fit:

@@ -67,7 +67,7 @@ def relocate_devices(model: CrossFit, links: Links, base: Base) -> CrossFit:
 
 
 def _moved_devices(before: Fit, after: Model) -> list[int]:
-    """Return the devices that moved by over `MIN_MOVE_M`, or were located in only one of both."""
+    """Return the devices that moved by over `MIN_MOVE_M`, or are located in only one model."""
     apart_m = np.linalg.norm(after.links.device_m - before.links.device_m, axis=1)
     moved = apart_m[before.links.device] > MIN_MOVE_M
     changed = (before.usable != after.usable) | (before.usable & moved)
@@ -75,9 +75,9 @@ def _moved_devices(before: Fit, after: Model) -> list[int]:
 
 
 def moves_help(before_nll: np.ndarray, after_nll: np.ndarray) -> bool:
-    """Return whether held-out links become likelier by moved devices.
+    """Return whether moved devices make the held-out links likelier, in sum.
 
-    If more links can be predicted, a loss of `MAX_LOSS_NATS` for each link is accepted.
+    If more links can be predicted than before, a loss of `MAX_LOSS_NATS` a link is accepted.
 
     Args:
         before_nll: (n,) held-out negative log-likelihood [nats]; NaN without a prediction.
@@ -126,7 +126,10 @@ def _located_anew(fit: Fit, links: Links, train: np.ndarray, base: Base,
 
 
 def _relocated(fit: Fit, unknown: list[int]) -> Model:
-    """Move unknown devices to their likeliest positions by a fit's training links; do not refit."""
+    """Move unknown devices to the positions that a fit's training links make likeliest.
+
+    Devices with fewer than `MIN_LINKS` links stay. The returned model is not fitted yet.
+    """
     learnt, model = fit.learnt, fit.model
     device_m = model.links.device_m.copy()
     for device in unknown:

@@ -15,12 +15,14 @@ from radiotwin.twin.model.correlated_shadowing import NAME as SHADOWING
 
 
 def add_trends(state: SearchState, inputs: SearchInputs, variables: Sequence[str]) -> SearchState:
-    """Add curves over variables on which the residual depends, if held-out links gain by them.
+    """Fit the remaining residual by curves over variables; keep those that improve held-out links.
+
+    Such a trend only describes the residual. At most `max_trends` variables are tried.
 
     Args:
-        state: state with all causes.
+        state: state of the search, with all causes that were found.
         inputs: inputs of the search.
-        variables: names of the variables, the most significant first.
+        variables: variables on which the residual depends, the most significant first.
     """
     values = residual_variables(state.model.links, state.model.held_out_mean_db)
     trends = [trend_over(name) for name in variables
@@ -29,12 +31,12 @@ def add_trends(state: SearchState, inputs: SearchInputs, variables: Sequence[str
 
 
 def add_shadowing(state: SearchState, inputs: SearchInputs) -> SearchState:
-    """Interpolate the residual over positions (kriging); keep it if held-out links gain by it."""
+    """Interpolate the residual over positions (kriging), if that makes held-out links likelier."""
     inputs.on_progress(SHADOWING)
     model = state.model
     fields = [each.rest(inputs.seed) for each in model.fits]
-    # If the field does not repeat on held-out flights, its mean may still help, without narrowing
-    # the error scale.
+    # The second try corrects the mean only and leaves the error scale as wide as before, which may
+    # help if the field does not repeat on held-out flights.
     for tried in (fields, [replace(each, certain=False) for each in fields]):
         extended = model.map(lambda fit, field: replace(fit, shadowing=field), tried)
         trial = score_model(model, extended, Trial(SHADOWING, step=state.step), inputs.criteria,

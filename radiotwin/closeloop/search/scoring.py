@@ -25,7 +25,8 @@ def ends_of(effect: Effect, coefficients: np.ndarray,
             links: Links) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the names of the devices and of the receivers that an effect acts on.
 
-    A sparse effect has a coefficient for each end; the end with the most extreme one is named.
+    A sparse effect has one coefficient for each device (or receiver). Of these only the one whose
+    coefficient is farthest from the median is named.
 
     Args:
         effect: the effect with its parameters.
@@ -78,13 +79,17 @@ def fit_candidate(model: CrossFit, effect: Effect, criteria: SelectionCriteria,
                   min_path_gain_nats: float = 0.0) -> Candidate | Trial:
     """Fit an effect to all links; return a refused trial with the reason if it is not plausible.
 
+    It is refused if it proposes no parameters, if the effect itself finds these implausible or
+    contradicted by links, or if it gains less than `min_training_gain_nats`.
+
     Args:
         model: cross-validated fit without the effect.
         effect: the effect to try.
         criteria: thresholds.
-        hypotheses: to compute its evidence with; None: it is not computed.
-        group: (m,) bool, training links that it has to explain; None: all.
-        min_path_gain_nats: least gain with fast levels for paths to be followed.
+        hypotheses: computes the evidence for the effect; None: no evidence.
+        group: (m,) bool, training links that the effect has to explain; None: all.
+        min_path_gain_nats: least gain, with levels by the quick law, from which the levels are
+            computed along paths, which takes longer.
     """
     refused = Trial(effect.name, step=len(model.whole.effects), variant=effect.variant)
     whole = add_effect(model.whole, effect, group=group)
@@ -115,13 +120,15 @@ def score_candidate(model: CrossFit, candidate: Candidate,
                     inputs: SearchInputs) -> tuple[Trial, CrossFit | None]:
     """Fit a candidate to each fold's training links, and score it on the held-out links.
 
+    It passes if these become likelier; trends need a gain of `min_gain_nats` in sum.
+
     Args:
         model: cross-validated fit without the candidate.
         candidate: effect fitted to all links.
         inputs: inputs of the search.
 
     Returns:
-        the trial, and the model with the effect; None if it does not pass.
+        the trial, and the model with the effect; None instead of the model if it does not pass.
     """
     found = candidate.whole.effects[-1]
     devices, receivers = ends_of(found, candidate.whole.coefficients_of(-1), model.links)
@@ -136,7 +143,10 @@ def score_candidate(model: CrossFit, candidate: Candidate,
 
 
 def with_candidate(model: CrossFit, candidate: Candidate, executor: Executor) -> CrossFit:
-    """Add a candidate to a model, and fit it anew to each fold's training links."""
+    """Add a candidate to the fit to all links, and fit it anew to each fold's training links.
+
+    A fold whose training links do not show the effect stays without it.
+    """
     effect, like = candidate.effect, candidate.whole.effects[-1]
     prepare_additions(model.folds, [effect], executor, like)
     return model.with_fits(candidate.whole, [add_effect(fold, effect, like) or fold
@@ -145,17 +155,17 @@ def with_candidate(model: CrossFit, candidate: Candidate, executor: Executor) ->
 
 def score_and_judge(model: CrossFit, candidate: Candidate, others: Sequence[float],
            hypotheses: Hypotheses, inputs: SearchInputs) -> tuple[Trial, CrossFit | None]:
-    """Score a candidate on held-out links, and compute its probability.
+    """Score a candidate on held-out links, and compute its probability beside its rivals.
 
     Args:
         model: cross-validated fit without the candidate.
         candidate: effect fitted to all links.
         others: evidence for rival causes [nats].
-        hypotheses: with which the evidence was computed.
+        hypotheses: of the model, with which the evidence was computed.
         inputs: inputs of the search.
 
     Returns:
-        the trial, and the model with the effect; None if it is refused.
+        the trial, and the model with the effect; None instead of the model if it is refused.
     """
     trial, extended = score_candidate(model, candidate, inputs)
     if extended is None:
@@ -170,7 +180,7 @@ def score_and_judge(model: CrossFit, candidate: Candidate, others: Sequence[floa
 
 def fit_and_score(model: CrossFit, effect: Effect, inputs: SearchInputs,
                   hypotheses: Hypotheses | None = None) -> tuple[Trial, CrossFit | None]:
-    """Fit an effect and score it on held-out links; the model is None if it is refused."""
+    """Fit an effect, score it on held-out links; return the trial, and the model unless refused."""
     candidate = fit_candidate(model, effect, inputs.criteria, hypotheses)
     if isinstance(candidate, Trial):
         return candidate, None
@@ -179,14 +189,16 @@ def fit_and_score(model: CrossFit, effect: Effect, inputs: SearchInputs,
 
 def score_model(model: CrossFit, extended: CrossFit, trial: Trial, criteria: SelectionCriteria,
                 min_gain_nats: float = 0.0) -> Trial:
-    """Score an extended model on held-out links, and refuse it if it does not predict them better.
+    """Compare an extended model with the one before on held-out links, and complete its trial.
+
+    Links that a fault affects, but that no training link of their fold shows, are not scored.
 
     Args:
         model: cross-validated fit before.
         extended: the fit with one more effect or with shadowing.
-        trial: to be completed.
-        criteria: thresholds; the RMSE may not rise by more than `max_rmse_rise`.
-        min_gain_nats: least gain of held-out log likelihood.
+        trial: trial of the extension, without scores.
+        criteria: thresholds; refused if the RMSE rises by more than the factor `max_rmse_rise`.
+        min_gain_nats: refused up to this gain of held-out log likelihood, summed over links.
 
     Returns:
         the trial with gains and RMSE, and a reason if it is refused.

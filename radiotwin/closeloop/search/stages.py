@@ -77,7 +77,7 @@ class SearchState:
         return self.step >= criteria.max_effects
 
     def look(self, seed: int) -> tuple[SearchState, Hypotheses]:
-        """Return the state with the hypotheses about its model, computed once for each model."""
+        """Return the state with the evidence for further effects, computed once for each model."""
         if self.looked_at is not None and self.looked_at[0] is self.model:
             return self, self.looked_at[1]
         found = Hypotheses.of(self.model.whole, seed)
@@ -101,7 +101,7 @@ Stage = Callable[[SearchState, SearchInputs], SearchState]
 
 
 def search(state: SearchState, stages: Iterable[Stage], inputs: SearchInputs) -> SearchState:
-    """Run stages one after the other.
+    """Run the stages of a search one after the other, each on the state that the last one left.
 
     Args:
         state: initial state.

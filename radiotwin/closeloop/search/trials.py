@@ -15,7 +15,7 @@ from radiotwin.effects.params import EffectParams
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """Result of trying one effect beside those found before.
+    """Result of trying one effect in addition to those found before.
 
     Attributes:
         name: name of the effect.
@@ -102,7 +102,7 @@ class TrialLog:
                                          enumerate(trials, start=len(self.trials)))))
 
     def supersede(self, *trials: Trial) -> TrialLog:
-        """Return the log with newer versions of trials that are in it.
+        """Return the log with some of its trials replaced by newer versions (of equal number).
 
         Raises:
             ValueError: a trial that was never recorded.

@@ -97,7 +97,10 @@ class Hypotheses:
 
     @cached_property
     def _rotated(self) -> tuple[np.ndarray, float, np.ndarray]:
-        """Whitened nuisance columns; log likelihood and log variances without a further cause."""
+        """Decorrelated nuisance columns; log likelihood and log variances without a further effect.
+
+        The (2,) variances are those of noise and of the field that is correlated over positions.
+        """
         columns = self.evidence.rotated(self.nuisance.values)
         found = self.evidence.of_rotated(self.evidence.rotated(self.base_z), columns,
                                          self.nuisance.prior_sd)
@@ -112,12 +115,13 @@ class Hypotheses:
 
     def gain_nats(self, z: np.ndarray, columns: Columns,
                   widening: np.ndarray | None = None) -> float:
-        """Return the log likelihood ratio of residuals with further columns over the fit's [nats].
+        """Return the evidence for an effect: its log marginal likelihood ratio [nats].
 
         Args:
-            z: (n,) residuals with the effect [error scales with the effect].
-            columns: design columns of the effect [the same scales].
-            widening: (n,) error scales with the effect over those without; None: 1.
+            z: (n,) residuals to be explained by the effect and the nuisances [error scales].
+            columns: design columns of the effect, divided by the error scales.
+            widening: (n,) factor by which the effect widens the error scales, by which `z` and
+                `columns` are divided; None: 1.
         """
         nuisance, base, theta = self._rotated
         if widening is not None:
@@ -135,7 +139,7 @@ class Hypotheses:
         return self.evidence.information(pattern, columns, self.nuisance.prior_sd, theta)
 
     def effect_evidence_nats(self, fit: Fit) -> float:
-        """Return the evidence for the last effect of a fit [nats].
+        """Return the evidence for the last effect of a fit, over the model without it [nats].
 
         Coefficients are integrated over their priors, and so are the searched parameters, whose
         effect on levels is linearised (Laplace's approximation; MacKay 2003, 'Information theory,
@@ -151,8 +155,8 @@ class Hypotheses:
             scale_db = np.hypot(scale_db, term.random_effect_sd_db)
             widening = scale_db / self.scale_db
         z = _clip_outliers(fit.model.training.residual_db(fit) / scale_db, self.near)
-        # Add the fitted contribution of the effect's columns and of the changed levels back, since
-        # the likelihood integrates over them.
+        # Add the fitted contribution of the effect's columns, and of the levels that changed with
+        # it, to the residual again, since the likelihood integrates over both.
         contribution_db = term.columns @ coefficients
         levels = fit.model.level_columns[fit.train]
         p = levels.shape[1]
@@ -167,7 +171,10 @@ class Hypotheses:
 
     def _sparse_evidence_nats(self, z: np.ndarray, columns: Columns,
                               coefficients: np.ndarray) -> float:
-        """Return the evidence for the best subset of columns with the largest coefficients (q,).
+        """Return the evidence for a sparse effect: only some devices (or receivers) deviate [nats].
+
+        Each column belongs to one of them. The subsets tried are the 1, 2, … columns whose
+        coefficients (q,) are farthest from the median, and all; the best one counts.
 
         The prior is uniform over the subset's size, and over the subsets of one size (Scott and
         Berger 2010, 'Bayes and empirical-Bayes multiplicity adjustment in the variable-selection
@@ -181,9 +188,10 @@ class Hypotheses:
         return max(found)
 
     def group_evidence_nats(self, group: np.ndarray) -> float:
-        """Return the evidence for an unnamed cause of a group of links (n,), at least 0 [nats].
+        """Return the evidence for an unnamed cause that acts only on a group of links, at least 0.
 
-        The cause is a curve over one variable; all variables are equally probable.
+        `group` is (n,) bool. The cause is a smooth curve over one variable, such as time; the
+        likelihoods are averaged over all variables [nats].
         """
         found = []
         for value, knots, is_angle in self._variables().values():
@@ -204,7 +212,10 @@ class Hypotheses:
         return found
 
     def _variables(self) -> dict[str, tuple[np.ndarray, int, bool]]:
-        """Return each variable's values (n,), number of knots, and whether it is an angle."""
+        """Return the variables of unnamed curves: values (n,), number of knots, whether an angle.
+
+        Left out are variables that under half of the links have, or with too few distinct values.
+        """
         links = self.links
         variables = {
             "time": (links.time_s, TIME_KNOTS, False),
@@ -220,7 +231,11 @@ class Hypotheses:
                 and len(np.unique(each[0][known])) >= KNOTS}  # else it is a label
 
     def _curves(self) -> Iterator[tuple[str, np.ndarray]]:
-        """Yield name and design columns of unnamed causes: of all links, by receiver, by device."""
+        """Yield name and design columns (n, q) of each unnamed cause.
+
+        Such a cause is a level of each flight of a receiver or device, or a curve over a variable,
+        common to all links or one for each receiver or device; at most `MAX_COLUMNS` columns.
+        """
         links = self.links
         ends = {"": None, "receiver": links.receiver, "device": links.device}
         flights = len(np.unique(links.flight))
@@ -243,7 +258,10 @@ class Hypotheses:
 
 
 def _slopes(fit: Fit) -> Columns:
-    """Return derivatives (n, q) of levels [dB] by the last effect's parameters, with prior sds."""
+    """Return derivatives (n, q) of levels [dB] by the last effect's searched parameters, if any.
+
+    Their prior sds are those of uniform distributions over the allowed ranges.
+    """
     model, effect = fit.model, fit.effects[-1]
     variation = effect.variation()
     if variation is None:
@@ -267,9 +285,10 @@ def _slopes(fit: Fit) -> Columns:
 
 def _nearest_links(series: np.ndarray, track: np.ndarray, position_m: np.ndarray,
                    known: np.ndarray) -> np.ndarray:
-    """Return the rows (n, `NEIGHBOURS`) of the nearest known links of the same series.
+    """Return the rows (n, `NEIGHBOURS`) of the nearest links, by the position of the moving end.
 
-    They are of the same track (n,), if it has enough: another flight may scatter less.
+    They are of the same fixed end and track, or of any track if this has too few: another flight
+    may scatter less. A link whose fixed end has too few gets its own row in all places.
 
     Args:
         series: (n,) label of the fixed end.
@@ -292,8 +311,8 @@ def _nearest_links(series: np.ndarray, track: np.ndarray, position_m: np.ndarray
 def _clip_outliers(z: np.ndarray, near: np.ndarray) -> np.ndarray:
     """Clip each residual (n,) to `MAX_Z` scales from the median of its neighbours.
 
-    The scale is at least 1, or the neighbours' own: a level or scatter that neighbours share is no
-    outlier.
+    The scale is the robust sd of the neighbours (rows `near`), at least 1: a level or scatter that
+    neighbours share is no outlier.
     """
     median = np.median(z[near], axis=1)
     scale = np.maximum(MAD_SD * np.median(np.abs(z[near] - median[:, None]), axis=1), 1.0)
@@ -301,9 +320,14 @@ def _clip_outliers(z: np.ndarray, near: np.ndarray) -> np.ndarray:
 
 
 def _nuisance(links: Links, mean_db: np.ndarray) -> tuple[Columns, list[slice]]:
-    """Return the nuisance columns [dB], and the slices of devices, receivers and tracks.
+    """Return design columns of usual errors of a base, which every hypothesis contains [dB].
 
-    They include a curve over the prediction (n,): weak links arrive by paths the base omits.
+    They are a level and a distance slope of LoS and of NLoS links, a curve over elevation and over
+    the predicted `mean_db` (n,), as weak links arrive by paths that the base omits, and a level of
+    each device, receiver and track (flight of a receiver).
+
+    Returns:
+        the columns with prior sds, and the slice of columns of each of the last three kinds.
     """
     slope = np.log10(links.distance_m / 100.0)
     blocks, prior_sd_db, families = [], [], []
@@ -325,10 +349,11 @@ def _nuisance(links: Links, mean_db: np.ndarray) -> tuple[Columns, list[slice]]:
 
 def _with_estimated_tolerances(evidence: CorrelatedEvidence, z: np.ndarray, nuisance: Columns,
                                families: list[slice]) -> Columns:
-    """Set the prior sd of each kind of ends to the robust spread of their levels, with shrinkage.
+    """Set the prior sd of the levels of devices, receivers and tracks to their estimated tolerance.
 
-    Levels are estimated with a wide prior. While fewer than half of the ends are faulty, the robust
-    spread is the tolerance of the good ones. Two ends tell nothing about it.
+    The levels of one kind (one of `families`) are estimated with a wide prior. If fewer than half
+    are faulty, their robust spread is the tolerance of the good ones. It is shrunk to `SPREAD_DB`,
+    fully so for two of a kind.
     """
     for family in families:
         prior_sd = nuisance.prior_sd.copy()

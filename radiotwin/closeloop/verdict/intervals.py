@@ -57,9 +57,9 @@ def effect_parameters(model: CrossFit) -> list[dict[str, Parameter]]:
 
 
 def _path_secants(whole: Linearised, fold: Fit) -> dict[int, list[Secant]]:
-    """Take derivatives along paths over from the fit to all links, by the effect's index in a fold.
+    """Copy derivatives of readings along paths from the fit to all links, by a fold's effect index.
 
-    Following paths around each fold's values would take minutes; a fold's derivatives only tell
+    Following paths around each fold's values would take minutes, and a fold's derivatives only tell
     whether its links determine a parameter.
     """
     known = {}
@@ -75,7 +75,10 @@ def _path_secants(whole: Linearised, fold: Fit) -> dict[int, list[Secant]]:
 
 
 def _with_jackknife(parameter: Parameter, folds: list[Parameter], count: int) -> Parameter:
-    """Widen the interval of a parameter by its values in folds; say whether it is determined.
+    """Widen the interval of a parameter to the spread of its estimates in folds.
+
+    Folds whose own interval is more than `MAX_WIDTH` times as wide are ignored. `determined` is set
+    as in `_checked`.
 
     Args:
         parameter: estimate from all links, with its sandwich interval.
@@ -95,7 +98,10 @@ def _width(parameter: Parameter) -> float:
 
 
 def _widened(parameter: Parameter, values: np.ndarray) -> Parameter:
-    """Widen a parameter's interval to that of the jackknife over its values (folds,)."""
+    """Widen a parameter's interval to contain the 90 % jackknife interval of its `values` (folds,).
+
+    Logarithmic parameters vary by a factor, periodic ones (angles) by the shorter way round.
+    """
     count, allowed = len(values), parameter.allowed
     if count < 2 or not np.isfinite(parameter.low):
         return parameter
@@ -114,7 +120,10 @@ def _widened(parameter: Parameter, values: np.ndarray) -> Parameter:
 
 
 def _checked(parameter: Parameter, found: int, folds: int) -> Parameter:
-    """Clip a parameter's interval to its allowed range, and set whether the data determine it."""
+    """Clip a parameter's interval to its allowed range, and set whether the data determine it.
+
+    They do if the interval is narrow, and at least `MIN_FOLDS` of the folds `found` the effect.
+    """
     allowed = parameter.allowed
     if not np.isfinite([parameter.low, parameter.high]).all():
         return parameter
@@ -159,9 +168,10 @@ def effect_size_db(model: CrossFit, number: int) -> Parameter:
 
 
 def why_not_confirmed(model: CrossFit, number: int) -> str:
-    """Return the reason if held-out links do not confirm an effect: its size may be 0; else "".
+    """Return why held-out links do not confirm an effect (given by its index); "" if they do.
 
-    Effects that only add scatter, and those that change no level, are not tested.
+    They do not if the 90 % interval of its size reaches down to 0. Effects that only add scatter,
+    and those that change no level, are not tested and count as confirmed.
     """
     size_db = effect_size_db(model, number)
     scatter_sd_db = model.whole.model.terms[number].random_effect_sd_db
@@ -176,8 +186,9 @@ def _size_regression(model: CrossFit, number: int
     """Return the held-out variables of the regression in `effect_size_db`, (n,) each.
 
     Returns:
-        change of the prediction by the effect against a refit without it [dB]; residual of that
-        refit [dB]; error scale [dB]; whether the effect acts on the link.
+        prediction with the effect minus that of a refit without it [dB]; measured level minus that
+        of the refit [dB]; error scale [dB]; whether the effect changes the link by over
+        `MIN_CHANGE_DB`. NaN in folds whose training links do not show the effect.
     """
     change_db, lacking_db, scale_db = np.full((3, len(model.index)), np.nan)
     acts = np.zeros(len(model.index), dtype=bool)
@@ -200,8 +211,8 @@ def _slope_half_width(influence: np.ndarray, share: np.ndarray, label: np.ndarra
     """Return half the 90 % interval of the slope, with errors clustered by a label (n,).
 
     Args:
-        influence: (n,) change of the slope by each link.
-        share: (n,) share of the information on the slope.
+        influence: (n,) change of the estimated slope that each link causes.
+        share: (n,) share of the information on the slope that each link gives.
         label: (n,) cluster of each link.
 
     Returns:

@@ -55,11 +55,11 @@ class Step:
 
 def judge(scores: Sequence[Trial], model: CrossFit, hypotheses: Hypotheses,
           criteria: SelectionCriteria) -> tuple[list[Trial], Step]:
-    """Compute the probability of every candidate of a step.
+    """Compute the probability of every candidate of a step, and refuse those that are too low.
 
     Args:
-        scores: trials of all candidates.
-        model: the fit without any of them.
+        scores: trials of all candidates; those without held-out scores stay as they are.
+        model: the fit without any candidate.
         hypotheses: evidence for further effects of that fit.
         criteria: a candidate that passed is refused below `min_probability`.
 
@@ -84,13 +84,13 @@ def judge(scores: Sequence[Trial], model: CrossFit, hypotheses: Hypotheses,
 
 def with_probability(score: Trial, others: Sequence[float], model: CrossFit,
                      rest_over_noise: float, criteria: SelectionCriteria) -> Trial:
-    """Add the probability to the trial of an effect; refuse it if that is too low.
+    """Add its probability to the trial of an effect, and refuse the effect if that is too low.
 
     Args:
         score: trial of a candidate that was scored on held-out links.
-        others: evidence for rival effects [nats].
+        others: evidence for rival effects, by which the candidate is less probable [nats].
         model: the fit without the candidate.
-        rest_over_noise: ratio of the standard deviations of place-bound residual and noise.
+        rest_over_noise: sd of the residual that depends on the place over the sd of noise.
         criteria: a candidate that passed is refused below `min_probability`.
     """
     nats = score.nats, score.held_out_nats, score.nats - max([0.0, *others])
@@ -106,8 +106,8 @@ def with_probability(score: Trial, others: Sequence[float], model: CrossFit,
 def verdict_without_effect(steps: Sequence[Step], criteria: SelectionCriteria) -> str:
     """Return `none` or `undecided` for a search that named no cause.
 
-    `none` if the first step finds it probable that nothing is hidden, and at most `max_rest_db` of
-    residual is place-bound.
+    `none` if the first step finds it probable that nothing is hidden, and the residual that depends
+    on the place has a standard deviation of at most `max_rest_db`.
 
     Args:
         steps: summaries of the search; empty if no cause was searched for.
@@ -124,12 +124,12 @@ def verdict_without_effect(steps: Sequence[Step], criteria: SelectionCriteria) -
 
 def features(nats: tuple[float, float, float], rest_over_noise: float,
              is_another_kind: bool) -> tuple[float, ...]:
-    """Return the five features of the logistic regression for a candidate.
+    """Return the five features from which a logistic regression predicts an effect's probability.
 
     Args:
-        nats: evidence beside a correlated residual, gain on held-out links, and lead of the
-            evidence over the best other effect that passed [nats].
-        rest_over_noise: ratio of the standard deviations of place-bound residual and noise.
+        nats: evidence with a correlated residual as the alternative, gain on held-out links, and
+            lead of the evidence over the best other effect that passed [nats].
+        rest_over_noise: sd of the residual that depends on the place over the sd of noise.
         is_another_kind: whether an effect of another name was found already.
     """
     return (*np.arcsinh(np.array(nats) / NATS).tolist(),
@@ -138,13 +138,13 @@ def features(nats: tuple[float, float, float], rest_over_noise: float,
 
 def probability_of_all(scores: Sequence[Trial], other: float, before: CrossFit,
                        rest_over_noise: float) -> float:
-    """Return the probability of several effects from the sum of their evidence.
+    """Return the probability that several effects are all present, from the sum of their evidence.
 
     Args:
-        scores: trials of the effects, each beside those before it.
+        scores: trials of the effects, each made with those before it in the model.
         other: evidence for the best other effect [nats].
         before: the fit without any of the effects.
-        rest_over_noise: ratio of the standard deviations of place-bound residual and noise, before.
+        rest_over_noise: sd of the residual that depends on the place over the sd of noise, before.
     """
     evidence, held_out = (sum(each.nats for each in scores),
                           sum(each.held_out_nats for each in scores))
@@ -162,9 +162,9 @@ def probability_of(name: str, values: tuple[float, ...]) -> float:
 
 @cache
 def _calibrated_log_odds(name: str) -> float:
-    """Return the calibrated log odds of an effect relative to the average effect.
+    """Return the log odds that the calibration adds for an effect of this name; the average is 0.
 
-    An effect without a calibration has that of the effect it is `calibrated_like`, or else 0.
+    An effect without a calibration has that of the effect named by `calibrated_like`, or else 0.
     """
     names = calibration()["effect"]["names"]
     return names[name] if name in names else max(
@@ -173,9 +173,11 @@ def _calibrated_log_odds(name: str) -> float:
 
 def _probabilities(scores: Sequence[Trial], unnamed_nats: float, rest_db: float,
                    noise_db: float) -> dict[str, float]:
-    """Return probabilities of the effects, of `NONE` and of `OTHER` that sum to 1.
+    """Return probabilities by effect, of `NONE` and of `OTHER`, that sum to 1.
 
-    An effect with several trials counts with its most probable one.
+    `NONE`: nothing is hidden in the residual; `OTHER`: a cause that is not in the catalogue. An
+    effect with several trials counts with its most probable one. The other arguments are those of
+    `_probability_of_nothing`.
     """
     found: dict[str, float] = {}
     for score in scores:
@@ -192,12 +194,12 @@ def _probabilities(scores: Sequence[Trial], unnamed_nats: float, rest_db: float,
 
 def _probability_of_nothing(named_nats: float, unnamed_nats: float, rest_db: float,
                             noise_db: float) -> float:
-    """Return the probability of no effect at all, given that none of the catalogue is present.
+    """Return the probability that nothing is hidden, if no effect of the catalogue is present.
 
     Args:
         named_nats: evidence for the best effect of the catalogue.
         unnamed_nats: evidence for the best unnamed curve.
-        rest_db: standard deviation of the place-bound residual.
+        rest_db: standard deviation of the residual that depends on the place.
         noise_db: standard deviation of noise.
     """
     weights = calibration()["nothing"]

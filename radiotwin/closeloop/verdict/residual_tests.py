@@ -34,7 +34,8 @@ class ResidualDependence:
 def dependences(model: CrossFit, seed: int) -> list[ResidualDependence]:
     """Test on which variables a model's held-out residual depends; the most significant first.
 
-    Links with a fault that their fold could not learn are left out.
+    Left out are links with a fault that the training links of their fold do not show. The `seed`
+    draws the permutations of the tests.
     """
     mean_db = model.held_out_mean_db
     residual_db = np.where(model.unforeseen, np.nan, model.links.level_db - mean_db)

@@ -44,7 +44,9 @@ class Detectable:
 
 def detectable(view: ResidualView, hypotheses: Hypotheses, criteria: SelectionCriteria,
                effects: Iterable[Effect], found_names: Set[str] = frozenset()) -> list[Detectable]:
-    """Return the least size from which each effect would have been named, if it can be found.
+    """Return the least size from which each effect, had it been present, would have been named.
+
+    Effects that were found, are declared, or cannot be searched for in these data are left out.
 
     Args:
         view: training links and residual of the last fit.
@@ -72,7 +74,11 @@ def detectable(view: ResidualView, hypotheses: Hypotheses, criteria: SelectionCr
 
 
 def _size_found(effect: Effect, view: ResidualView, pattern: Pattern, size: float) -> float:
-    """Enlarge a pattern until the effect's search finds it; return that size, or inf."""
+    """Return the size from which an effect's search finds a pattern added to the residual; or inf.
+
+    The size grows from the given one by `GROWTH` [unit of the pattern]. The search finds the
+    pattern if a proposal explains at least `EXPLAINED` of what the pattern itself explains.
+    """
     for _ in range(MAX_TRIALS):
         if size > min(pattern.high, MAX_SIZE):
             break
@@ -88,12 +94,12 @@ def _size_found(effect: Effect, view: ResidualView, pattern: Pattern, size: floa
 
 def needed_nats(name: str, probability: float, rest_over_noise: float,
                 is_another_kind: bool = False) -> float:
-    """Return the evidence that gives an effect without rivals a probability [nats]; or inf.
+    """Return the least evidence for an effect without rivals to reach a probability [nats]; or inf.
 
     Args:
         name: name of the effect.
-        probability: to be reached.
-        rest_over_noise: ratio of the standard deviations of place-bound residual and noise.
+        probability: the probability to be reached.
+        rest_over_noise: sd of the residual that depends on the place over the sd of noise.
         is_another_kind: whether an effect of another name was found already.
     """
     def excess(nats: float) -> float:
