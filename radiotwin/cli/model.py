@@ -321,12 +321,14 @@ def _print(report: dict[str, Any]) -> None:
         f"Error on held-out links (by {report['heldout']['by']}) [dB], base {report['base']}",
         {"of": "left", "": "left", "links": "right", "RMSE": "right", "MAE": "right",
          "bias": "right"}, rows)
-    rows = [[effect["name"], name, *_estimate(estimate), estimate["unit"]]
-            for effect in report["effects"] for name, estimate in effect["parameters"].items()]
-    if rows:
-        print_rows("Added to the base", {
-            "effect": "left", "parameter": "left", "value": "right", "low": "right",
-            "high": "right", "unit": "left"}, rows)
+    for title, is_declared in (("Parts of the base", True), ("Added to the base", False)):
+        rows = [[effect["name"], name, *_estimate(estimate), estimate["unit"]]
+                for effect in report["effects"] if effect.get("is_declared", False) == is_declared
+                for name, estimate in effect["parameters"].items()]
+        if rows:
+            print_rows(title, {
+                "effect": "left", "parameter": "left", "value": "right", "low": "right",
+                "high": "right", "unit": "left"}, rows)
 
 
 def _estimate(estimate: dict[str, Any]) -> list[float | str]:

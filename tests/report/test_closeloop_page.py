@@ -363,7 +363,7 @@ def test_times_since_1970_are_dates_and_no_other_quantity_is(tmp_path):
     assert "60.00 to 80.00" in page
 
 
-def test_where_nothing_was_found_the_error_stays_and_its_part_of_places_is_shown(tmp_path):
+def test_where_nothing_was_found_the_error_stays_and_its_part_of_places_is_shown(tmp_path, monkeypatch):
     roofs = DRIFT | {"is_declared": True}
     nothing = report("none", effects=[roofs])
     text = page(nothing, tmp_path)
@@ -371,6 +371,10 @@ def test_where_nothing_was_found_the_error_stays_and_its_part_of_places_is_shown
     assert "<dt>RMSE of 900 links, as before</dt><dd>3.00 dB</dd>" in text
     assert "<dt>of that, repeats at a place</dt><dd>2.68 dB</dd>" in text
     assert "3.00 → " not in text and ">before and after</td>" in text and ">after</td>" not in text
+    printed = []
+    monkeypatch.setattr(loop, "print_rows", lambda title, columns, rows: printed.append(title))
+    loop._print(nothing | {"error": nothing["error"] | {"by_los": {}}, "baselines": {}})
+    assert printed[1:] == ["Parts of the base"]
 
 
 def test_errors_of_other_links_are_no_headline_and_are_labelled(tmp_path):
