@@ -15,7 +15,7 @@ from radiotwin.effects.arrays import ends_above
 from radiotwin.effects.base import LevelAt, ResidualView
 from radiotwin.effects.boxes import Box, cross
 from radiotwin.effects.params import Metres
-from radiotwin.effects.patterns import Pattern, crossed
+from radiotwin.effects.patterns import Pattern, lengths_in_boxes
 from radiotwin.effects.places import Correction, Mark
 from radiotwin.links import Links
 
@@ -70,7 +70,7 @@ class Crane(GainEffect):
 
     @override
     def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:
-        for inside_m in crossed(view.links, HIGH_M):
+        for inside_m in lengths_in_boxes(view.links, HIGH_M):
             yield Pattern("place", "dB", "of links through a tower", -1.0 * (inside_m > 0),
                           high=MAX_LOSS_DB)
 

@@ -24,6 +24,7 @@ from radiotwin.cli.options import (
     parse_numbers,
     split_names,
 )
+from radiotwin.display import count
 from radiotwin.errors import BadInput
 from radiotwin.runtime.console import notice, print_rows, result, say
 
@@ -149,7 +150,8 @@ def map_(
         written = export_map(source, world, out, devices=split_names(devices),
                              altitudes_m=heights_m, name=str(twin), tell=notice)
     z, y, x = written.lattice.shape
-    say(f"wrote {out}: {len(written.devices)} devices, {z} altitudes of {x} by {y} positions")
+    say(f"wrote {out}: {count(len(written.devices), 'device')}, {count(z, 'altitude')} of {x} by "
+        f"{y} positions")
 
 
 def compare(

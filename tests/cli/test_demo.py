@@ -39,8 +39,8 @@ def test_the_whole_chain_ends_in_a_page(run, city_xml, monkeypatch):
     page = (folder / "out" / "report.html").read_text()
     assert page.count("<img ") == 3 and not re.search(r'<[^>]*(src|href)="(?!data:)', page), "nothing from a network"
     assert 'id="radiotwin-data"' in page
-    for model in ("log_distance", "segmented_nn", "kriging"):
-        assert model in result.stdout and model in page
+    for model, label in (("log_distance", "log-distance"), ("segmented_nn", "segmented NN"), ("kriging", "kriging")):
+        assert model in result.stdout and label in page
     for name in ("scene/truth.nc", "survey/devices.csv", "twin/twin.json", "comparison/compare.json"):
         assert (folder / "out" / name).is_file()
 

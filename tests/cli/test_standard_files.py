@@ -48,7 +48,7 @@ def test_scenes_out(run, folder, out):
 def test_maps_out(run, folder, suffix):
     result = run(f"map map.nc --scene scene -o part.{suffix} --devices d1 --altitudes 60", cwd=folder)
     assert result.returncode == 0, result.stderr
-    assert f"wrote part.{suffix}: 1 devices on (1, 16, 16) positions" in result.stdout
+    assert f"wrote part.{suffix}: 1 device, 1 altitude of 16 by 16 positions" in result.stdout
     assert (folder / f"part.{suffix}").stat().st_size > 500
 
 

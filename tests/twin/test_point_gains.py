@@ -111,6 +111,6 @@ def test_received_powers_are_gains_above_the_power_that_is_told(small_scene):
     attributes = powers.radio_map(told).dataset.attrs
     assert attributes["tx_power_dbm"] == 14 and attributes["gain_limit_db"] == pytest.approx(powers.limit_db - 14)
     assert "tx_power_dbm" not in gains.radio_map(small_scene).dataset.attrs
-    with pytest.warns(UserWarning, match="default of .*scene.toml is taken, 0 dBm"):
+    with pytest.warns(UserWarning, match="nobody declared: 0 dBm is assumed"):
         too_high_db = gains_at(powers, small_scene, POINTS_M[:2], ["d0", "d1"])
     np.testing.assert_allclose(too_high_db, own_db + 14, atol=0.05)
