@@ -24,7 +24,6 @@ from radiotwin.cli.options import (
     parse_numbers,
     split_names,
 )
-from radiotwin.display import count
 from radiotwin.errors import BadInput
 from radiotwin.runtime.console import notice, print_rows, result, say
 
@@ -132,6 +131,7 @@ def map_(
 
     It holds the gain of every device over the scene's lattice.
     """
+    from radiotwin.display import count
     from radiotwin.io.inputs import keep_inputs, keep_others
     from radiotwin.maps.file import is_map
     from radiotwin.report import check_map_target, export_map
