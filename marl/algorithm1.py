@@ -231,7 +231,7 @@ class Campaign:
 
     def log(self, learner: Learner, mission: Mission, rng: np.random.Generator,
             simulated: int) -> None:
-        """Evaluate the policy in the maps of twin and truth, and add a row to the log; NaN without.
+        """Evaluate the policy in the twin's and the truth's map, if any, and add a row to the log.
 
         Args:
             learner: learner that was prepared in this round.

@@ -55,7 +55,7 @@ class Prior(NamedTuple):
     @classmethod
     def of_mission(cls, mission: Mission, level_sd_db: float = 0.0, silent: float = 0.0,
                    data_spread: float = 0.0) -> "Prior":
-        """Return the prior with a single candidate for each device: the mission's map."""
+        """Return the prior with a single candidate position for each device: the mission's map."""
         devices = mission.devices
         return cls(mission.snr_db.swapaxes(0, 1)[:, None], mission.sigma_db.swapaxes(0, 1)[:, None],
                    np.ones((devices, 1)), np.full(devices, float(level_sd_db)), 0.0,
@@ -153,7 +153,7 @@ def _expected_table(mission: Mission) -> np.ndarray:
 @njit(cache=True, nogil=True, error_model="numpy")
 def _hear(prior: Prior, state: _State, uav: int, level: int, row: int, column: int, kept: float,
           snr_db: np.ndarray, limit_db: float) -> None:
-    """Update the filter by a UAV's readings (K,).
+    """Update the Kalman filters of all candidate positions by a UAV's readings of K devices.
 
     Args:
         prior: prior of the belief.
@@ -225,7 +225,7 @@ def _below(depth: float) -> tuple[float, float]:
 @njit(cache=True, nogil=True, error_model="numpy")
 def _value(prior: Prior, state: _State, weight: np.ndarray, levels: np.ndarray, cell: np.ndarray,
            step_m: float, table: np.ndarray, value: np.ndarray) -> None:
-    """Add the expected data of a slot, averaged over all candidates, to `value` (U, K, ny, nx)."""
+    """Add the data expected in a slot, averaged over candidate positions, to `value`, in place."""
     uavs, devices, rows, columns = value.shape
     lasting = math.sqrt(prior.share)
     near = np.zeros((rows, columns))

@@ -329,7 +329,7 @@ def next_action(mission: Mission, uav: int, row: int, column: int, battery: int,
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def take_off(mission: Mission, devices: int) -> TourFlight:
-    """Return the state of all UAVs at their starts, before the first slot."""
+    """Return the state before the first slot: UAVs at their starts, all data at the devices."""
     uavs = len(mission.battery)
     return TourFlight(mission.start.copy(), mission.battery.copy(), mission.data_units.copy(),
                       np.zeros(uavs, np.int64), np.zeros(uavs, np.int64),

@@ -190,7 +190,7 @@ class QNetworks:
             self.targets[name].load_state_dict(module.state_dict())
 
     def _batch(self, flights: Flights, mission: Mission) -> Batch:
-        """Pack flights with the features of the present mission."""
+        """Pack flights into a training batch, with features computed for the present mission."""
         order = np.argsort(-flights.length, kind="stable")
         slots = np.arange(flights.length.max())
         valid = slots[:, None] < flights.length[order]
@@ -461,7 +461,7 @@ class QMIX(Learner):
         return ratio
 
     def _train(self, episodes: int) -> tuple[dict[str, float], dict[str, np.ndarray]]:
-        """Train all replicas; return the mean of their records, and the merged weights."""
+        """Train all replicas; return the mean of their records, and their weights (`_merged`)."""
         records, each = self._trainers.call("train", episodes), self._trainers.call("weights")
         for record in records:
             self.training.flights += episodes

@@ -198,7 +198,7 @@ class _Mind:
             u: [] for u in range(mission.uavs)}
 
     def look(self, frame: Frame, flight: int, slot: int) -> None:
-        """Update belief and data left by what the UAVs of this mind receive in a slot."""
+        """Update belief and data left by the SNRs that its own UAVs receive in a slot."""
         for u in self._uavs:
             if not frame.battery[flight, u]:
                 continue

@@ -107,10 +107,9 @@ def _exchange(one: np.ndarray, other: np.ndarray) -> None:
 @njit(cache=True, nogil=True, error_model="numpy")
 def _draw_waypoint(waypoint: np.ndarray, peaks: np.ndarray, left: np.ndarray, rows: int,
                    columns: int, rng: np.random.Generator) -> None:
-    """Draw a waypoint (3,) in place: row, column and hovers.
+    """Draw a waypoint (3,) in place: with probability 0.7 near a device's peak cell, else anywhere.
 
-    With probability 0.7 it is near the peak cell of a device, else anywhere. The device is, of two
-    random ones, that with more data left.
+    Of two random devices, the one with more data left is taken.
     """
     if rng.random() < 0.7:
         k, other = rng.integers(0, len(peaks)), rng.integers(0, len(peaks))

@@ -22,7 +22,7 @@ MAX_TRIES = 50  # draws until all positions are outside buildings
 
 def twin_prior(twin: Twin, scene: Scene, radio_map: RadioMap, rng: np.random.Generator,
                silent: float = 0.0, data_spread: float = 0.0) -> Prior:
-    """Return the prior of a belief by a twin's position radii and map errors.
+    """Return the prior over device positions and SNR maps that a twin's uncertainty implies.
 
     Args:
         twin: twin with positions, credible radii and map errors.

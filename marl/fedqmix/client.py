@@ -154,6 +154,7 @@ class Client:
             write_csv(pd.DataFrame(campaign.rows), temporary)
 
     def _save(self) -> None:
+        """Write the checkpoint: campaign, replica, and rounds and real episodes done."""
         campaign = self._campaign
         save_checkpoint(campaign.state(self._party.folder) | {
             "done": self._done, "entered": self._entered, "replica": self._replica.state(False),
@@ -161,6 +162,7 @@ class Client:
             self._party.folder / NAME)
 
     def _restore(self, state: dict, path: Path) -> None:
+        """Continue from the state of a checkpoint; raise Damaged if it is not of this run."""
         campaign = self._campaign
         campaign.load_state(state, path, ("done", "entered", "replica", "spent"))
         self._done = require(state["done"], range(len(self._schedule) + 1), "done")

@@ -135,7 +135,10 @@ def _require_several(index: np.ndarray, by: str) -> np.ndarray:
 
 
 def _can_hold_out_flights(links: Links) -> bool:
-    """Return whether devices and receivers typically recur in at least `MIN_FLIGHTS` flights."""
+    """Return whether devices and receivers typically recur in at least `MIN_FLIGHTS` flights.
+
+    False also if one flight has more than half of the detected links.
+    """
     if len(np.unique(links.flight)) < MIN_FLIGHTS:
         return False
     seen = np.bincount(links.flight[np.isfinite(links.level_db)])
@@ -287,7 +290,7 @@ class CrossFit:
         return self.with_fits(whole, folds)
 
     def held_out(self, predict: Callable[[Fit], np.ndarray]) -> np.ndarray:
-        """Predict each link by the fit that has not seen it.
+        """Predict each link by the fit to the links outside of its fold.
 
         Args:
             predict: returns values (…, n) of all links by one fold's fit.
@@ -523,7 +526,7 @@ def paths_gain_db(links: Links, scene: Scene, folds: Folds, seed: int) -> float:
 
 
 def _with_evidence(links: Links, whole: Model) -> Links:
-    """Group links with correlated residuals into pieces that count once, unless that was done."""
+    """Group links with correlated residuals into pieces of evidence, unless they have some."""
     if links.evidence is not None:
         return links
     view, z = whole.fit().view, np.full(len(links), np.nan)

@@ -62,7 +62,7 @@ class Readings:
 
     @cached_property
     def previous(self) -> np.ndarray:
-        """(n,) row of the previous reading of the same ends in the flight; -1 for the first."""
+        """(n,) row of the previous reading of the same link in the flight; -1 for the first."""
         series = combined_labels(self.device, self.receiver, self.flight)
         order = np.lexsort((np.arange(len(self)), self.time_s, series))
         found = np.full(len(self), -1)
@@ -140,8 +140,8 @@ class Family:
 def units_of(readings: Readings) -> Units:
     """Label readings that share errors, by squares of ground around the moving end.
 
-    Errors of one pass are shared within `PASSING_M` in a flight; lasting ones, which are errors of
-    the map, by readings of one device within `LASTING_M`.
+    Readings of a flight in one square of `PASSING_M` share errors of that pass. Readings of a
+    device in one square of `LASTING_M` share errors of the map, which last.
     """
     passing, lasting = (_squares_of(readings.moving_m, width_m)
                         for width_m in (PASSING_M, LASTING_M))
@@ -198,7 +198,7 @@ def families_of(readings: Readings, units: Units) -> Iterator[Family]:
 
 def _pairs(readings: Readings, first: str, second: str,
            labels: Mapping[str, np.ndarray], units: Units) -> Iterator[Family]:
-    """Yield pairs of two kinds of ends, unless each end of one kind occurs in a single pair."""
+    """Yield the pairs of two kinds (device, receiver, flight), unless each has one partner."""
     one, other = labels[first], labels[second]
     code = combined_labels(one, other)
     count = int(code.max()) + 1
@@ -265,7 +265,7 @@ def _share_of_time(readings: Readings, label: np.ndarray) -> np.ndarray:
 
 
 def _describe_window(readings: Readings, scope: str, code: np.ndarray) -> Callable:
-    """Return the function `Family.describe` for windows of time with labels `code` (n,)."""
+    """Return the function that names flight, receiver and time range of each window in `code`."""
     def describe(group: int) -> Description:
         rows = code == group
         flight = readings.flight[rows][0]
@@ -393,7 +393,7 @@ def _places(readings: Readings, units: Units) -> Iterator[Family]:
 
 def _square_family(link: np.ndarray, cell: np.ndarray, width_m: float,
                    ends: tuple[np.ndarray, ...], units: Units) -> Family:
-    """Return the family of the links in, or across, each square of ground.
+    """Return a family with one group for each square of ground: the links in it, or across it.
 
     Args:
         link: (m,) a link that is in a square; pairs of link and square may repeat.

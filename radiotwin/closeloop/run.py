@@ -103,7 +103,7 @@ class Loop(Summarised):
 
     @cached_property
     def for_twin(self) -> CrossFit:
-        """`after`, fitted again without effects that only describe the residual and fit no map.
+        """`after`, fitted again without descriptive effects that a map cannot show.
 
         If there is no such effect, `after` itself, with its interpolated shadowing.
         """

@@ -40,7 +40,7 @@ class LeastDeviation:
 
 
 def least_deviations(model: CrossFit) -> list[LeastDeviation]:
-    """Find for each family the least deviation of a typical group that the scan would report.
+    """Find the least deviation that the scan would report, for each family (kind of group).
 
     Args:
         model: cross-validated fit without anomalies in its held-out residual.

@@ -276,10 +276,10 @@ def _anomaly(found: Anomaly) -> dict[str, Any]:
 
 
 def same_over(found: Anomaly, base: CrossFit) -> list[str]:
-    """Return over which of `flight` and `direction` a device or receiver deviates equally.
+    """Return whether the level of a device or receiver deviates in all flights and directions.
 
-    In every flight (or octant) of the group, the level must deviate from the other links by at
-    least half of the anomaly's size.
+    In each flight (or octant of azimuth) it must differ from the other links by at least half of
+    the anomaly's size.
 
     Returns:
         `flight`, `direction`, both or neither; empty for other groups and other statistics.

@@ -271,6 +271,7 @@ class ReportRecord(Record):
 
     @model_validator(mode="after")
     def _none_beside_no_group(self) -> Self:
+        """Refuse a verdict that contradicts whether the report has anomalies."""
         if self.verdict == "none" and self.anomalies:
             raise ValueError("the verdict is none, and groups of links stand out")
         if self.verdict == "located" and not self.anomalies:

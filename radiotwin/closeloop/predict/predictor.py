@@ -180,7 +180,7 @@ def _combined(learnt: FittedModel, fit: Fit, found: Combination) -> FittedModel:
 
 
 def _held_out(learnt: FittedModel, fit: Fit, test: np.ndarray, fold: np.ndarray) -> HeldOut:
-    """Predict rows (m,) of a fit's links by each member; `fold` (m,) is the fold of each row."""
+    """Predict the links `test` (m,) of a fit by each learnt member; `fold` (m,) is their fold."""
     assert learnt.blend is not None
     tested = fit.on_rows(test)
     members_db, scales_db, unheard_db = learnt.members_on(tested)

@@ -128,7 +128,7 @@ def _weights(held_out: HeldOut, away: HeldOut, half_m: float, sd_ratio: tuple[fl
              dof: float) -> np.ndarray:
     """Fit weights (2, k) of k members, near and far, by least squared error of readings.
 
-    Quadrants (`away`) count less, until every fold is predicted nearly as well (`AS_GOOD`) as by
+    Quadrants (`away`) count less, until unseen folds are predicted nearly as well (`AS_GOOD`) as by
     the best member; otherwise this member gets all weight. Weights below `MIN_WEIGHT` become 0.
     """
     sets = []

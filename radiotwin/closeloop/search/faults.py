@@ -55,10 +55,7 @@ def add_changes(state: SearchState, inputs: SearchInputs) -> SearchState:
 
 
 def _add_changes_of(state: SearchState, effect: Effect, inputs: SearchInputs) -> SearchState:
-    """Add changes between flights by one effect, one after the other, until none passes.
-
-    They are scored on blocks of ground that are held out in all flights.
-    """
+    """Add changes of one effect between flights, scored on held-out ground, until none passes."""
     model = None
     while not state.is_full(inputs.criteria):
         state, hypotheses = state.look(inputs.seed)

@@ -115,7 +115,7 @@ class Hypotheses:
 
     def gain_nats(self, z: np.ndarray, columns: Columns,
                   widening: np.ndarray | None = None) -> float:
-        """Return the evidence for an effect: its log marginal likelihood ratio [nats].
+        """Return the evidence for an effect: log marginal likelihood ratio over the fit [nats].
 
         Args:
             z: (n,) residuals to be explained by the effect and the nuisances [error scales].

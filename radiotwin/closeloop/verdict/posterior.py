@@ -55,7 +55,7 @@ class Step:
 
 def judge(scores: Sequence[Trial], model: CrossFit, hypotheses: Hypotheses,
           criteria: SelectionCriteria) -> tuple[list[Trial], Step]:
-    """Compute the probability of every candidate of a step, and refuse those that are too low.
+    """Compute the probability of every candidate of a step, and refuse the improbable ones.
 
     Args:
         scores: trials of all candidates; those without held-out scores stay as they are.
@@ -84,7 +84,7 @@ def judge(scores: Sequence[Trial], model: CrossFit, hypotheses: Hypotheses,
 
 def with_probability(score: Trial, others: Sequence[float], model: CrossFit,
                      rest_over_noise: float, criteria: SelectionCriteria) -> Trial:
-    """Add its probability to the trial of an effect, and refuse the effect if that is too low.
+    """Compute the probability of an effect from its trial, and refuse the effect if it is too low.
 
     Args:
         score: trial of a candidate that was scored on held-out links.

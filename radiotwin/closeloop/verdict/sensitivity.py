@@ -46,7 +46,7 @@ def detectable(view: ResidualView, hypotheses: Hypotheses, criteria: SelectionCr
                effects: Iterable[Effect], found_names: Set[str] = frozenset()) -> list[Detectable]:
     """Return the least size from which each effect, had it been present, would have been named.
 
-    Effects that were found, are declared, or cannot be searched for in these data are left out.
+    Left out are effects that were found (unless repeatable), declared or unavailable in the data.
 
     Args:
         view: training links and residual of the last fit.
