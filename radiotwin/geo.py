@@ -79,7 +79,7 @@ def _projection(origin: Origin) -> "Proj":
 
 
 def reference_system(name: str) -> "CRS":
-    """Look up a coordinate reference system by `AUTHORITY:CODE`, URN, title of PROJ's, or WKT.
+    """Look up a coordinate reference system by `AUTHORITY:CODE`, URN, title in PROJ, or WKT.
 
     Raises:
         pyproj.exceptions.CRSError: the name is unknown, or of a form that could open a file.
@@ -114,7 +114,7 @@ class FrameRecord(Table):
 
 
 def read_frame(folder: Path) -> Origin | None:
-    """Read the origin of the tables in a folder from its `frame.toml`; None if it has none.
+    """Read the origin of a folder's local frame from its `frame.toml`; None if there is no file.
 
     Raises:
         BadInput: the file cannot be read, is a link out of the folder, or has an impossible value.
@@ -151,7 +151,7 @@ def origin_text(origin: Origin) -> str:
 
 
 def is_same_frame(one: Origin, other: Origin) -> bool:
-    """Return whether two origins define the same local frame, but for rounding."""
+    """Return whether two origins agree to 1e-9 degrees and, if both have an altitude, 1 mm."""
     turn_deg = abs(one.longitude_deg - other.longitude_deg) % 360
     return (abs(one.latitude_deg - other.latitude_deg) <= SAME_DEG
             and min(turn_deg, 360 - turn_deg) <= SAME_DEG
@@ -180,7 +180,7 @@ def _datum_difference_m(source: Origin, target: Origin) -> float:
 
 
 def median_origin(places: pd.DataFrame) -> Origin:
-    """Return the median of the columns latitude and longitude [degrees]; some rows may be NaN.
+    """Return the median of the columns latitude and longitude [degrees], ignoring NaN.
 
     >>> median_origin(pd.DataFrame({"latitude": [10.0, 12.0], "longitude": [179.0, -179.0]}))
     Origin(latitude_deg=11.0, longitude_deg=-180.0, altitude_m=0.0)
@@ -209,7 +209,7 @@ def with_coordinates(table: pd.DataFrame, position_m: np.ndarray,
 
 def with_datum_heights(table: pd.DataFrame, what: str, position: list[str],
                        ground_height_m: GroundHeight | None) -> pd.DataFrame:
-    """Convert heights above the ground to heights above the datum (z), and drop their column.
+    """Convert heights above the ground to heights above z = 0, and drop their column.
 
     Args:
         table: columns x, y and z, and one named like z with `above_ground_m` in the place of `z_m`;

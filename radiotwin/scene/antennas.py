@@ -163,7 +163,7 @@ def parse_pattern(path: Path, text: bytes) -> Pattern:
 
 
 def between_cuts(horizontal_db: np.ndarray, vertical_db: np.ndarray) -> np.ndarray:
-    """Interpolate relative gain over the sphere from two cuts: horizontal projection [1].
+    """Interpolate relative gain over the sphere from two cuts, by horizontal projection [1].
 
     With f the azimuth's fraction of the way from the front (0) to the back (1):
     G(az, el) = G_H(az) - (1 - f) (G_H(0) - G_V(el)) - f (G_H(180) - G_V(180 - el)).
@@ -187,7 +187,7 @@ def between_cuts(horizontal_db: np.ndarray, vertical_db: np.ndarray) -> np.ndarr
 
 
 def _read_msi(path: Path, text: bytes) -> Pattern:
-    """Parse an MSI Planet file: GAIN and two cuts."""
+    """Parse an MSI Planet file: GAIN [dBd or dBi], and two cuts of attenuations [dB]."""
     gain_dbi: float | None = None
     cuts: dict[str, dict[float, float]] = {"HORIZONTAL": {}, "VERTICAL": {}}
     cut: dict[float, float] | None = None

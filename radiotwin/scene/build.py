@@ -143,7 +143,7 @@ class BuildReport:
         return any(problem.severity == "error" for problem in self.problems)
 
     def load_scene(self) -> Scene:
-        """Load the scene that was written.
+        """Load the scene that was written when the report was made.
 
         Raises:
             BadInput: it was only checked.
@@ -242,7 +242,7 @@ class BuildOptions:
     layers: tuple[str, ...] = ()
 
     def check(self) -> None:
-        """Raise BadInput for an impossible value; options for maps only are checked by readers."""
+        """Raise BadInput for an impossible value; `check_map_options` checks those for maps."""
         if self.scale is not None and not 0 < self.scale < float("inf"):
             raise BadInput(f"scale {self.scale:g} is not possible; give a positive factor (feet: "
                            "0.3048)")
@@ -351,7 +351,7 @@ class Declared:
 
 def finish_scene(city: ImportedCity, declared: Declared, out_folder: Path, options: BuildOptions,
                  check_only: bool, buildings: pd.DataFrame | None = None) -> BuildReport:
-    """Place devices and UAVs in a city, write its scene folder, and report on it.
+    """Choose a city's lattice, devices and UAVs, write its scene folder, and report on it.
 
     Args:
         city: City in the scene's frame without errors; problems of materials are appended.
@@ -381,7 +381,11 @@ def finish_scene(city: ImportedCity, declared: Declared, out_folder: Path, optio
 def write_scene(folder: Path, shapes: list[CityShape], config: SceneConfig,
                 buildings: pd.DataFrame | None = None,
                 streets_m: Sequence[np.ndarray] = ()) -> None:
-    """Write a scene folder with its preview, and the tables of buildings and streets it has."""
+    """Write a scene folder: `city.xml`, `scene.toml`, its tables, and a preview picture.
+
+    A `scene.toml` that it replaces is kept beside it, see `keep_declarations`. `buildings.csv`
+    needs a table of buildings, `streets.geojson` an origin and streets.
+    """
     with atomic_folder(folder) as temporary:
         write_city(temporary, shapes)
         write_config(config, temporary / "scene.toml")
@@ -395,7 +399,7 @@ def write_scene(folder: Path, shapes: list[CityShape], config: SceneConfig,
 
 def _city_shapes(city: ImportedCity, frequency_hz: float
                  ) -> tuple[list[CityShape], list[Problem]]:
-    """Return the shapes of a city with materials that Sionna RT accepts, and problems with them."""
+    """Return a city's shapes with materials that Sionna RT accepts, and notes of those changed."""
     assert city.surfaces is not None  # without an error among the problems
     materials = [material for material in city.materials if material is not None]
     taken = Names(name.lower() for name in city.names)
@@ -408,7 +412,12 @@ def _city_shapes(city: ImportedCity, frequency_hz: float
 
 def _plan(city: ImportedCity, declared: Declared, options: BuildOptions
           ) -> tuple[SceneConfig, float, float, str]:
-    """Return `scene.toml`, the built fraction, and the tallest building's height [m] and name."""
+    """Return the content of `scene.toml`, the built fraction, and the tallest building.
+
+    Extent, altitudes, devices and UAVs are chosen where they are not declared. The built fraction
+    is the share of the extent under buildings; of the tallest building, its height above the ground
+    [m] and its name are returned.
+    """
     assert city.surfaces is not None  # without an error among the problems
     surfaces, solid = city.surfaces, ~city.ground
     if declared.extent is None:

@@ -83,9 +83,9 @@ def check_up_axis(surfaces: Surfaces, ground: np.ndarray) -> list[Problem]:
 
 
 def _has_ground_below(surfaces: Surfaces) -> bool:
-    """Return whether ground covers 80 % of the city's plan and lies at its bottom.
+    """Return whether ground covers 80 % of the city's plan and lies at its lowest level.
 
-    The latter tells ground from a level surface high up, such as a screen in a room.
+    The level tells ground from a flat surface high up, such as a screen in a room.
     """
     ground = surfaces.ground_faces()
     size = np.ptp(surfaces.vertices, axis=0)
@@ -99,7 +99,11 @@ def _has_ground_below(surfaces: Surfaces) -> bool:
 
 
 def check_units(surfaces: Surfaces) -> list[Problem]:
-    """Return a warning if sizes look like another unit than metres, an error if none fits."""
+    """Return a warning if sizes look like another unit than metres, or an error above 100 km.
+
+    It looks like kilometres if nothing is 1 m tall and the city narrower than 100 m; like feet,
+    centimetres or millimetres if half of the parts with walls are taller than `MAX_MEDIAN_M`.
+    """
     low, high = surfaces.part_bounds()
     heights = (high - low)[surfaces.wall_share > 0.1, 2]  # of parts with walls
     width = float(np.ptp(surfaces.vertices[:, :2], axis=0).max())
@@ -137,7 +141,7 @@ def check_ground(ground: np.ndarray, surfaces: Surfaces) -> list[Problem]:
 
 
 def check_closed(surfaces: Surfaces, ground: np.ndarray, names: Sequence[str]) -> list[Problem]:
-    """Return warnings about meshes that are not watertight, and roofs that are not joined to walls.
+    """Return warnings about meshes with holes, and about roofs not joined to their walls.
 
     The ground may be open: `ground`, (f,) bool, are its faces.
     """

@@ -61,7 +61,7 @@ def _embree_scene(triangles: np.ndarray) -> Any:
 
 
 def _distinct(triangles: np.ndarray) -> np.ndarray:
-    """Return the indices of triangles (n, 3, 3), in single precision, without duplicates.
+    """Return the indices of triangles (n, 3, 3), one of each set of equal ones (single precision).
 
     Embree tests every duplicate of a triangle that a ray meets.
     """
@@ -160,7 +160,7 @@ class CityMap:
         return (np.abs(self.vertices[self.faces][:, :, 2]) < GROUND_M).all(axis=1)
 
     def without(self, faces: np.ndarray) -> CityMap:
-        """Return a map without the given faces, (f,) bool."""
+        """Return a map without the faces that are True in `faces`, (f,) bool."""
         terrain, height_sd_m = (None if values is None else values[~faces]
                                 for values in (self.terrain, self.height_sd_m))
         return CityMap(self.vertices, self.faces[~faces], self.materials, self.material[~faces],
@@ -215,9 +215,10 @@ class CityMap:
         return ~self.ground.line_of_sight(a_m, b_m)
 
     def _sight_over_earth(self, a_m: np.ndarray, b_m: np.ndarray) -> np.ndarray:
-        """Return whether long links (n,) have line of sight over the round Earth.
+        """Return whether long links have line of sight over the round Earth, (n,) bool.
 
-        The bent line is tested piece by piece; over flat ground also against the horizon.
+        Instead of the ground, the line between a and b is bent, by the effective Earth radius, and
+        tested piece by piece; over flat ground also against the horizon.
         """
         offset_m = b_m - a_m
         length_m = np.hypot(offset_m[:, 0], offset_m[:, 1])
@@ -271,7 +272,7 @@ class CityMap:
         return self._terrain_height_m(x_m.ravel(), y_m.ravel()).reshape(x_m.shape)
 
     def _terrain_height_m(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
-        """Return the heights (n,) of the terrain at x and y (n,) [m], by rays from above."""
+        """Return the terrain's heights (n,) at x and y (n,) [m], by rays; in holes, the nearest."""
         ground = self.ground
         low_m, high_m = ground.vertices[:, :2].min(axis=0), ground.vertices[:, :2].max(axis=0)
         points_m = np.column_stack([x_m, y_m])
@@ -349,7 +350,7 @@ class CityMap:
         return metres + np.where(depth > 0, length - last, 0.0)
 
     def _depth(self, points_m: np.ndarray) -> np.ndarray:
-        """Return the (n,) number of solids that each point lies in."""
+        """Return the number (n,) of solids that each point (n, 3) [m] lies in, by a ray upwards."""
         above = points_m.copy()
         above[:, 2] = np.maximum(self._top_m, points_m[:, 2] + 1.0)
         depth = np.zeros(len(points_m), dtype=int)
@@ -359,10 +360,11 @@ class CityMap:
 
     def _crossings(self, a_m: np.ndarray, b_m: np.ndarray
                    ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Yield the first crossing of each segment (a, b) with a surface, then the second, etc.
+        """Yield where segments (a, b) first cross a surface, then where they next do, and so on.
 
         Yields:
-            Distances from a [m], +1 for entering or -1 for leaving a solid, indices of segments.
+            Of the segments that cross once more: distance from a [m], +1 for entering or -1 for
+            leaving a solid, and index.
         """
         ray = np.arange(len(a_m))
         length = np.linalg.norm(b_m - a_m, axis=1)
@@ -443,11 +445,11 @@ def building_of_vertex(city: CityMap) -> np.ndarray:
 
 @lru_cache(maxsize=8)  # a map also holds its precomputed walls and edges: tens of MB
 def perturbed_map(city: CityMap, wall_sd_m: float, height_sd_m: float, seed: int) -> CityMap:
-    """Return a map with normal errors of every building's walls and height.
+    """Return a map with normally distributed errors of every building's walls and height.
 
     The walls on opposite sides of a building move independently, so that it is shifted and grows or
-    shrinks; its roof keeps its shape. The errors of a seed are proportional to the standard
-    deviations.
+    shrinks; its roof keeps its shape. A seed always draws the same errors, in units of the
+    standard deviations.
 
     Args:
         city: Map to perturb.

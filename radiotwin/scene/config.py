@@ -67,6 +67,7 @@ class RadioConfig(Table):
 
     @model_validator(mode="after")
     def _something_is_detected(self) -> "RadioConfig":
+        """Check that the sensitivity lies below the transmit power; return the table."""
         if self.sensitivity_dbm >= self.tx_power_dbm:
             raise ValueError(
                 f"sensitivity_dbm = {self.sensitivity_dbm:g} must lie below tx_power_dbm = "
@@ -266,7 +267,7 @@ _UNITS = {"m": "m", "hz": "Hz", "dbm": "dBm", "db": "dB", "deg": "degrees", "s":
 
 
 def _explain(path: Path, error: ValidationError) -> str:
-    """Format pydantic's errors: file, key, value and remedy, a line each."""
+    """Format the errors of an invalid `scene.toml`: a line each with file, key, value, remedy."""
     lines = []
     problems = error.errors(include_url=False)
     for problem in problems[:_MAX_MESSAGES]:

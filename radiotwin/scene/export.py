@@ -64,7 +64,7 @@ def _colour(material: Material) -> tuple[int, int, int]:
 
 
 def _write_gltf(shapes: list[CityShape], path: Path) -> None:
-    """Write glTF 2.0 with one coloured mesh per shape, and everything in one file."""
+    """Write glTF 2.0 (y up) with one coloured mesh per shape, and everything in one file."""
     model = trimesh.Scene()
     for shape in shapes:
         mesh = shape.mesh.copy()
@@ -84,7 +84,7 @@ def _write_gltf(shapes: list[CityShape], path: Path) -> None:
 
 
 def _write_obj(shapes: list[CityShape], path: Path) -> None:
-    """Write one object per shape; single precision needs nine digits."""
+    """Write an OBJ file (z up) with one object per shape, and its colours as `.mtl`."""
     lines, first = ["# radiotwin", f"mtllib {path.stem}.mtl"], 1
     for shape in shapes:
         lines += [f"o {shape.name}", f"usemtl {shape.material.name}"]

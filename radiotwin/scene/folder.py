@@ -212,9 +212,12 @@ def check_target(folder: Path, allowed: Set[str] = SCENE_FILES, source: Path | N
 
 
 def keep_declarations(folder: Path, new: Path) -> None:
-    """Keep a replaced `scene.toml` that differs, as `scene.toml.old`, with a warning.
+    """Save a scene's earlier `scene.toml`, which may be edited by hand, as `scene.toml.old`.
 
-    It may have been edited by hand. `new` is the folder with the new `scene.toml`.
+    Args:
+        folder: Scene folder that is to be replaced.
+        new: Folder that replaces it, with a `scene.toml`. If the earlier one differs, it is copied
+            there, with a warning; else an older `scene.toml.old` is.
     """
     before = folder / "scene.toml"
     if before.is_file() and not filecmp.cmp(before, new / "scene.toml", shallow=False):
@@ -239,7 +242,7 @@ def published_scene(name: str) -> Path:
 
 
 def sionna_scenes() -> dict[str, Path]:
-    """Return name -> XML file of the scenes that sionna-rt brings, without importing it."""
+    """Return name -> XML file of the scenes in the package sionna-rt, without importing it."""
     spec = find_spec("sionna")
     roots = [] if spec is None else spec.submodule_search_locations or []
     return {path.parent.name: path for root in roots

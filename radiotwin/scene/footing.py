@@ -39,11 +39,11 @@ class Footing:
 
 
 def footing(city: CityMap, point_m: np.ndarray) -> Footing | None:
-    """Find the likeliest position outdoors of a device (3,) [m] that is indoors in the map.
+    """Find the likeliest position outdoors for a device (3,) [m] that the map shows indoors.
 
-    Returns:
-        the position that needs the smallest error of the map, in standard deviations; None if all
-        need more than `MAX_SDS`.
+    Candidates are just above the ground, on the roof, and beside the nearest wall. The one is
+    returned that needs the smallest error of the map, in standard deviations of that height or
+    wall; None if all need more than `MAX_SDS`.
     """
     candidates = (_above_surface(city, point_m, to_ground=True),
                   _above_surface(city, point_m, to_ground=False), _beside_wall(city, point_m))
@@ -52,7 +52,7 @@ def footing(city: CityMap, point_m: np.ndarray) -> Footing | None:
 
 
 def moved_outdoors(city: CityMap, points_m: np.ndarray) -> np.ndarray:
-    """Return positions (n, 3) [m] of devices, with the misplaced ones corrected by `footing`."""
+    """Return positions (n, 3) [m] of devices, the misplaced ones moved outdoors by `footing`."""
     corrected_m = points_m.copy()
     for row in np.flatnonzero(city.misplaced(points_m) != ""):
         found = footing(city, points_m[row])
@@ -62,7 +62,10 @@ def moved_outdoors(city: CityMap, points_m: np.ndarray) -> np.ndarray:
 
 
 def _above_surface(city: CityMap, point_m: np.ndarray, to_ground: bool) -> Footing | None:
-    """Return the position just above the ground, or the roof; None if that is lower or indoors."""
+    """Return the position just above the ground (else the roof) at a point (3,) [m], or None.
+
+    None if that surface is below the point, is no roof, or the position is indoors.
+    """
     x_m, y_m, z_m = point_m.tolist()
     ground_m = float(city.ground_height_m(x_m, y_m))
     surface_m, sd_m, what = ground_m, GROUND_SD_M, "the ground"
@@ -77,7 +80,10 @@ def _above_surface(city: CityMap, point_m: np.ndarray, to_ground: bool) -> Footi
 
 
 def _roof_m(city: CityMap, x_m: float, y_m: float) -> tuple[float, float]:
-    """Return the height of the highest surface at x and y, and its standard deviation [m]."""
+    """Return the height of the highest surface at x and y, and its standard deviation [m].
+
+    The height is -inf if there is no surface. An unknown deviation is `HEIGHT_SD_M`.
+    """
     above_m = np.array([[x_m, y_m, city.vertices[:, 2].max() + 1.0]])
     distance_m, face, _ = city.first_hits_towards(above_m, DOWN)
     if face[0] < 0:
@@ -87,7 +93,10 @@ def _roof_m(city: CityMap, x_m: float, y_m: float) -> tuple[float, float]:
 
 
 def _beside_wall(city: CityMap, point_m: np.ndarray) -> Footing | None:
-    """Return the position just outside the nearest wall; None if that is too far."""
+    """Return the position just outside the nearest wall; None if that is too far.
+
+    The limit is `MAX_SDS` standard deviations of a wall's position, `WALL_SD_M`.
+    """
     steps_m = np.arange(0.0, MAX_SDS * WALL_SD_M, STEP_M) + STEP_M
     angle_rad = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
     towards = np.column_stack([np.sin(angle_rad), np.cos(angle_rad), np.zeros(DIRECTIONS)])

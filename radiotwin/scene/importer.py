@@ -114,7 +114,10 @@ class _Source:
 
 
 def _read_source(path: Path, overrides: Mapping[str, str]) -> _Source:
-    """Open a file by its suffix; BadInput if an override matches none of its materials."""
+    """Open a city's file: a mesh model or an XML scene; BadInput if an override fits no material.
+
+    `overrides` are ITU materials by a material's name. Meshes of XML scenes are read when used.
+    """
     if path.suffix.lower() in UP_AXES:
         parts = read_model(path)
         materials_by_name([part.material for part in parts], overrides)
@@ -132,7 +135,7 @@ def _read_source(path: Path, overrides: Mapping[str, str]) -> _Source:
 
 
 def _safe_names(wanted_names: Sequence[str]) -> tuple[list[str], list[Problem]]:
-    """Return unique names that Sionna RT and file systems accept, and the problems fixed."""
+    """Return unique names that Sionna RT and file systems accept, and which were changed."""
     taken = Names(RESERVED_NAMES)
     names, changed, double = [], [], []
     for wanted in wanted_names:
@@ -172,7 +175,11 @@ class _Loaded:
 
 
 def _load_meshes(path: Path, source: _Source, scale: float, up: str, bbox: Box | None) -> _Loaded:
-    """Read the shapes, turn them upright in metres, and keep those that reach into the box."""
+    """Read the shapes of a city, convert them to metres with z up, and clean them.
+
+    Shapes that do not reach into the box are dropped (None: all are kept). `scale` is the factor to
+    metres, `up` the file's axis that points up.
+    """
     loaded = _Loaded()
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     budget = MeshBudget(path)
@@ -227,7 +234,7 @@ def _load_meshes(path: Path, source: _Source, scale: float, up: str, bbox: Box |
 
 
 def _orient(surfaces: Surfaces, names: Sequence[str]) -> tuple[Surfaces, list[Problem]]:
-    """Orient the triangles of each mesh: solids face outwards, sheets upwards."""
+    """Turn triangles so that solids face outwards and sheets upwards; also return problems."""
     problems = []
     mixed = surfaces.inconsistent_shapes()
     if len(mixed):
@@ -253,7 +260,10 @@ def _orient(surfaces: Surfaces, names: Sequence[str]) -> tuple[Surfaces, list[Pr
 
 def _join_roofs_to_walls(names: list[str], materials: list[Material | None], surfaces: Surfaces
                          ) -> tuple[list[str], list[Material | None], Surfaces, list[Problem]]:
-    """Join roofs and walls of one material, so that Sionna RT finds the edge between them."""
+    """Join meshes of one material where a roof meets a wall; also return the problems.
+
+    Sionna RT lets an edge diffract only within a mesh. A joined mesh has its first one's name.
+    """
     pairs = surfaces.seams()
     pairs = pairs[[materials[a] is not None and materials[a] == materials[b] for a, b in pairs]]
     if len(pairs) == 0:
@@ -277,7 +287,7 @@ def _join_roofs_to_walls(names: list[str], materials: list[Material | None], sur
 
 
 def _cut_to_box(city: ImportedCity, surfaces: Surfaces, bbox: Box) -> ImportedCity:
-    """Keep the shapes, and the single triangles of the ground, whose bounds reach into the box."""
+    """Keep the shapes whose bounds reach into the box; of the ground, the single triangles."""
     low, high = surfaces.face_bounds()
     overlaps = ((low[:, :2] <= bbox[2:]) & (high[:, :2] >= bbox[:2])).all(axis=1)
     shape_low = np.full((surfaces.shapes, 2), np.inf)

@@ -100,7 +100,7 @@ class Names(set[str]):
         self._last_numbers: dict[str, int] = {}  # so that many equal names take linear time
 
     def unique(self, name: str) -> str:
-        """Add a name, with a number appended if it is taken but for its case, and return it."""
+        """Add a name and return it; if it is taken (ignoring case), with a number: `name_2`."""
         free, number = name, self._last_numbers.get(name.lower(), 1)
         while free.lower() in self:
             number += 1
@@ -311,7 +311,10 @@ class _Mapper:
     bare: list[str] = field(default_factory=list)
 
     def material_of(self, shape: DeclaredShape) -> Material | None:
-        """Return the material of a shape; None if it has none or an unknown one."""
+        """Return the material of a shape, or None and note the problem.
+
+        Problems are shapes that name no material, or one without radio constants.
+        """
         if shape.material is None:
             self.bare.append(shape.name)
             return None
@@ -331,7 +334,7 @@ class _Mapper:
         return self.known[identifier]
 
     def all_problems(self) -> list[Problem]:
-        """Return the problems of all shapes so far."""
+        """Return the problems of all shapes so far; shapes without a material are one problem."""
         found = list(self.problems)
         if self.legacy:
             found.append(problems.fixed(
@@ -344,7 +347,10 @@ class _Mapper:
         return found
 
     def _resolve(self, identifier: str, node: Node | None) -> Material:
-        """Return the material of an identifier and its `<bsdf>`; _Unmapped if it is unknown."""
+        """Find the radio material of a `<bsdf>` by an override, its ITU name, or its constants.
+
+        _Unmapped, with a remedy, if it has none of these, or is not declared (`node` is None).
+        """
         base = identifier.removeprefix("mat-")
         for key in (identifier, base):
             if key in self.overrides:
@@ -379,7 +385,7 @@ class _Mapper:
 
 
 def _with_surface(identifier: str, node: Node, material: Material) -> Material:
-    """Add thickness and scattering of a `<bsdf>` to its material, and check all constants."""
+    """Return the material with thickness and scattering of its `<bsdf>`, all values checked."""
     material = replace(
         material,
         thickness_m=node.number("thickness", Material.thickness_m),
@@ -481,7 +487,7 @@ STANDARD = MaterialTable(
 
 
 def read_material_table(path: Path | str) -> MaterialTable:
-    """Read a TOML file whose entries replace, and come before, those of the standard table.
+    """Read a table of materials by tag from a TOML file; its entries precede the standard ones.
 
     Args:
         path: file with `default`, `ground`, `roof`, and tables named after keys of tags, which are
@@ -516,10 +522,10 @@ def read_material_table(path: Path | str) -> MaterialTable:
 
 
 def with_materials(table: MaterialTable, overrides: Mapping[str, str]) -> MaterialTable:
-    """Override entries of a table.
+    """Return a table of materials with some entries replaced.
 
     Args:
-        table: table to change.
+        table: table that is copied.
         overrides: `default`, `ground`, `roof`, or a value of `building:material` -> ITU material.
 
     Raises:

@@ -45,7 +45,7 @@ class RawMesh:
 
 
 def load_shapes(shapes: Iterable[DeclaredShape], source: Path) -> Iterator[RawMesh]:
-    """Load the shapes of the XML file `source` one by one.
+    """Load the shapes of the XML file `source` one by one, within limits for all together.
 
     Raises:
         BadInput: As `load_shape`, or all shapes together have too many vertices or faces.
@@ -99,7 +99,7 @@ def load_shape(shape: DeclaredShape) -> RawMesh:
 
 
 def _read_mesh_file(shape: DeclaredShape) -> RawMesh:
-    """Read the PLY or OBJ file of a shape."""
+    """Read the PLY or OBJ file of a shape; all objects of an OBJ file become one mesh."""
     path = shape.mesh_path
     if path is None:
         raise BadInput(f"{shape.node.position}: the shape names no mesh file; add "
@@ -114,12 +114,12 @@ def _read_mesh_file(shape: DeclaredShape) -> RawMesh:
 
 
 def cut_polygons(path: Path, vertices: np.ndarray, polygons: list[np.ndarray]) -> RawMesh:
-    """Check polygons and cut them into triangles.
+    """Check polygons, and cut them into the triangles of a mesh.
 
     Args:
         path: File, for messages.
         vertices: (v, 3) positions.
-        polygons: For each number of corners k, (n, k) indices of vertices.
+        polygons: For each number of corners k, (n, k) indices of vertices; with k below 3, ignored.
 
     Raises:
         BadInput: A coordinate is not finite or too large, a face names a vertex that does not
@@ -196,7 +196,7 @@ def cut_polygon(corners: np.ndarray, ends: Sequence[int]) -> np.ndarray:
 def _check_crossings(rings: list[np.ndarray]) -> None:
     """Raise BadInput if a polygon (rings of (n, 2) corners) crosses itself too often.
 
-    Earcut's time then grows with the square of the number of corners, or faster.
+    The time to cut it into triangles grows with the square of the number of corners, or faster.
     """
     import shapely
 
@@ -213,6 +213,8 @@ def _with_left_out_corners(triangles: np.ndarray, ends: Sequence[int]) -> np.nda
     """Add triangles at corners that earcut dropped because they lie on a straight line.
 
     Neighbouring faces still have these corners: without such triangles a closed surface would open.
+    `ends` are the numbers of corners up to the end of each ring. If the ring seems to cross itself,
+    the triangles are returned unchanged.
     """
     n = ends[-1]
     if len(triangles) == n + 2 * len(ends) - 4 or len(triangles) == 0:  # every corner is used
@@ -329,7 +331,7 @@ def clean(vertices_m: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the index of the first of all equal rows of (n, 3), ascending, and the inverse (n,).
+    """Return the index of each distinct row of (n, 3), sorted, and which one each row is, (n,).
 
     As `np.unique(rows, axis=0, return_index=True, return_inverse=True)`, but in a tenth of the time
     for few rows.
@@ -360,7 +362,7 @@ def _edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def is_volume(vertices_m: np.ndarray, faces: np.ndarray) -> bool:
-    """Return whether triangles enclose a volume: two at every edge, normals outwards."""
+    """Return whether triangles enclose a volume: exactly two at every edge, normals outwards."""
     forward, backward = _edges(faces)
     if (len(forward) == 0 or (forward != backward).any()
             or (forward[1:] == forward[:-1]).any()):

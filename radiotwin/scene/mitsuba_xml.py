@@ -180,7 +180,7 @@ def shown(text: str) -> str:
 def _check_city(root: Node) -> None:
     """Raise BadInput if the `city.xml` of a scene folder has an element that is not allowed.
 
-    Ignored elements are removed from its `<scene>`.
+    Elements without meaning for radio (`IGNORED`) are first removed from `root`.
     """
     root.children = [child for child in root.children if child.tag not in IGNORED]
     waiting = [root]
@@ -196,7 +196,10 @@ def _check_city(root: Node) -> None:
 
 
 def _check_attributes(node: Node) -> None:
-    """Raise BadInput if an element of `city.xml` has an attribute, type or value not allowed."""
+    """Raise BadInput if an element of `city.xml` has an attribute, type or value not allowed.
+
+    Numbers must be finite, and no value may hold a `$`.
+    """
     for name, value in node.attributes.items():
         if name not in _ATTRIBUTES[node.tag]:
             raise BadInput(f"{node.position}: <{node.tag}> has {shown(name)}, which is not "
@@ -277,7 +280,7 @@ class _Reader:
         self._read_file(path, ())
 
     def _read_file(self, path: Path, above: tuple[Path, ...]) -> None:
-        """Read a file; `above` are the files that include it, from the outermost."""
+        """Read a scene file; `above` are the files that include it, from the outermost."""
         root = self.xml.read(path)
         if root.tag != "scene":
             raise BadInput(f"{root.position}: the file begins with <{root.tag[:60]}>, not <scene>; "
@@ -287,7 +290,10 @@ class _Reader:
         self._read_children(root, (*above, path.resolve()))
 
     def _read_children(self, parent: Node, files: tuple[Path, ...]) -> None:
-        """Read the elements of a `<scene>`, and those within `merge`; `files` are open."""
+        """Read the materials, shapes, includes and parameters of a `<scene>` and its `merge`.
+
+        `files` are the file and those that include it.
+        """
         waiting = parent.children[::-1]
         while waiting:
             node = waiting.pop()
@@ -318,7 +324,7 @@ class _Reader:
                 self._read_shape(node)
 
     def _include(self, node: Node, files: tuple[Path, ...]) -> None:
-        """Read the file of an `<include>`; BadInput if files include each other in a loop."""
+        """Read the file of an `<include>`; BadInput if it is among `files`, which include it."""
         path = self._find_file(node, node.attributes.get("filename", ""))
         if len(files) > MAX_INCLUDE_DEPTH or path.resolve() in files:
             raise BadInput(f"{node.position}: more than {MAX_INCLUDE_DEPTH} files include each "
@@ -326,9 +332,9 @@ class _Reader:
         self._read_file(path, files)
 
     def _substitute(self, node: Node) -> None:
-        """Replace `$name` in an element's attributes by the parameter's value.
+        """Replace each `$name` in an element's attributes by the parameter's value, in place.
 
-        In identifiers and names, a `$` without a parameter stays.
+        BadInput if there is no such parameter, except in identifiers and names: there `$` stays.
         """
         for key, text in node.attributes.items():
             if "$" not in text:
@@ -350,7 +356,10 @@ class _Reader:
             node.attributes[key] = "".join(parts)
 
     def _find_file(self, node: Node, name: str) -> Path:
-        """Return the path of a file that an element names; it must lie below the first file's."""
+        """Return the path of a file that an element names; it must lie in the scene file's folder.
+
+        It is looked for beside the element's file, then in the folders of `<path>` elements.
+        """
         if len(name) > MAX_NAME:
             raise BadInput(f"{node.position}: {shown(name)} is not the name of a file: it has "
                            f"{len(name):,} characters")
@@ -361,7 +370,7 @@ class _Reader:
         return require_within(self.folders[0], node.file.parent / name, node.position)
 
     def _read_shape(self, node: Node) -> None:
-        """Add the shape of a `<shape>` element to the city."""
+        """Add a `<shape>` element to the city's shapes, with transform, file and material."""
         SHAPES.check(len(self.city.shapes) + 1, node.file)
         kind = node.attributes.get("type", "")
         file_name = node.get("string", "filename")

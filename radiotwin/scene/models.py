@@ -79,7 +79,7 @@ def _read_gltf(path: Path) -> list[ModelPart]:
 
 
 def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes | None]:
-    """Return the JSON and the binary chunk of a `.glb` file."""
+    """Return the JSON and the binary chunk (None: absent) of a `.glb` file."""
     chunks: dict[bytes, bytes] = {}
     at = 12
     while at + 8 <= len(data):
@@ -121,7 +121,7 @@ class _Document:
         return self._list(key)[index]
 
     def _buffers(self, binary: bytes | None) -> list[bytes]:
-        """Return the content of all buffers: the binary chunk, base64 texts, files beside it."""
+        """Return each buffer's bytes: the binary chunk, base64 text, or a file beside the model."""
         buffers, size = [], 0
         FILES.check(len(self._list("buffers")), self.path)
         for number, buffer in enumerate(self._list("buffers")):
@@ -156,7 +156,7 @@ class _Document:
             raise ValueError(f"a buffer is not in base64: {error}") from None
 
     def parts(self) -> Iterator[ModelPart]:
-        """Yield the primitives of the scene's objects, in its coordinates."""
+        """Yield the triangles of each object of a glTF model, one mesh per material."""
         vertices = parts = 0
         for name, mesh, to_world in self._placed():
             for primitive in self._entry("meshes", mesh)["primitives"]:
@@ -178,9 +178,9 @@ class _Document:
                     RawMesh(moved, faces[:, ::-1] if mirrored else faces))
 
     def _placed(self) -> Iterator[tuple[str, int, np.ndarray]]:
-        """Yield name, mesh index and (4, 4) transform of each node that has a mesh.
+        """Yield name, mesh index and (4, 4) transform of each node of the glTF scene with a mesh.
 
-        A node that occurs twice in the scene's graph is an error.
+        A node that occurs twice in the scene's graph is an error. Without scenes, all nodes count.
         """
         scenes = self._list("scenes")
         roots = self._entry("scenes", self.document.get("scene", 0)).get("nodes") or [] \
@@ -208,7 +208,10 @@ class _Document:
         return str(self._entry(key, index).get("name") or f"{key}_{index}")[:200]
 
     def _faces(self, primitive: dict[str, Any], points: int) -> np.ndarray | None:
-        """Return the triangles (f, 3) of a primitive, strips and fans cut; None: points, lines."""
+        """Return the triangles (f, 3) of a glTF primitive; None if it has points or lines.
+
+        `points` is its number of vertices. Strips and fans are cut into triangles.
+        """
         mode = primitive.get("mode", _TRIANGLES)
         if mode not in (_TRIANGLES, _STRIP, _FAN):
             return None
@@ -231,7 +234,10 @@ class _Document:
         return strip
 
     def _accessor(self, index: Any, kind: str) -> np.ndarray:
-        """Return the (n, components) values of an accessor, a view of its buffer."""
+        """Return the (n, components) values of a glTF accessor, an array within a buffer.
+
+        `kind` is `SCALAR` (integers) or `VEC3` (reals); ValueError if it is another, or damaged.
+        """
         accessor = self._entry("accessors", index)
         if accessor["type"] != kind or "sparse" in accessor or accessor.get("bufferView") is None:
             raise ValueError(f"accessor {index} is sparse, empty, or not of type {kind}")
@@ -256,7 +262,7 @@ class _Document:
 
 
 def _transform(node: dict[str, Any]) -> np.ndarray:
-    """Return the (4, 4) transform of a node: a matrix, or translation × rotation × scale [1]."""
+    """Return a glTF node's (4, 4) transform: a matrix, or translation × rotation × scale [1]."""
     if "matrix" in node:
         return np.array(node["matrix"], dtype=float).reshape(4, 4).T
     transform = np.eye(4)
@@ -274,7 +280,7 @@ def _transform(node: dict[str, Any]) -> np.ndarray:
 
 
 def read_model(path: Path) -> list[ModelPart]:
-    """Read a model: its objects, cut by material; in STL and PLY, the connected parts.
+    """Read a mesh model: its objects by material; of STL and PLY, the connected parts.
 
     Raises:
         BadInput: no such file, damaged, too large, or without triangles.
@@ -341,7 +347,7 @@ def _ascii_corners(path: Path, data: bytes) -> np.ndarray:
 
 
 def _submesh(path: Path, vertices: np.ndarray, polygons: list[np.ndarray]) -> RawMesh:
-    """Return the mesh of one object of a model; `vertices` (v, 3) are those of all objects."""
+    """Return the mesh of one object: of the model's vertices (v, 3), only those it uses."""
     used = np.unique(np.concatenate([group.ravel() for group in polygons]))
     if len(used) and (used[0] < 0 or used[-1] >= len(vertices)):
         return cut_polygons(path, vertices, polygons)  # raises the error

@@ -40,8 +40,9 @@ class BuiltGrid:
 
     @classmethod
     def over(cls, extent: Extent, buildings: CityMap | None) -> "BuiltGrid":
-        """Make a grid with cells of 1 m, larger where that would need more than 2 million.
+        """Find which cells of an extent are under a building, on a grid of 1 m cells.
 
+        Cells are smaller in an extent below 50 m, and larger where 1 m would need over 2 million.
         `buildings` is a map without ground; None: there are no buildings.
 
         Raises:
@@ -87,7 +88,8 @@ def building_bounds(surfaces: Surfaces, solid: np.ndarray) -> tuple[float, float
     """Return the horizontal bounding box of the buildings, x_min, x_max, y_min, y_max [m].
 
     `solid`, (f,) bool, are the faces of buildings. If there are none, or their box is narrower than
-    a tenth of its length, the box of the whole city is taken, and widened to that if necessary.
+    a tenth of its length, the whole city's box is taken. A box that is still narrower than that is
+    widened.
     """
     box = np.zeros((2, 2))
     for faces in (solid, np.ones_like(solid)):
@@ -105,8 +107,8 @@ def building_tops(surfaces: Surfaces, solid: np.ndarray, ground: CityMap | None
                   ) -> tuple[np.ndarray, np.ndarray]:
     """Return the height (shapes,) of each building's top above the datum, and above the ground [m].
 
-    The ground is taken below the middle of the shape, from a map without buildings (None: at 0).
-    Shapes without faces of buildings (`solid`, (f,) bool) have 0.
+    The ground is taken below the centroid of the shape, from a map without buildings (None: at 0).
+    A shape of which no face is True in `solid`, (f,) bool, is no building, and has 0.
     """
     _, high = surfaces.face_bounds()
     tops_m = np.zeros(surfaces.shapes)
@@ -144,7 +146,7 @@ def make_extent(bounds: tuple[float, float, float, float]) -> Extent:
 
 
 def choose_step(bounds: tuple[float, float, float, float]) -> float:
-    """Return 20 m, or the next of 10, 5, 2, 1, ... that fits five times into the narrower side."""
+    """Return the largest step of 20, 10, 5, 2, 1, … m that fits five times into each side."""
     x_min, x_max, y_min, y_max = bounds
     for exponent in range(1, -6, -1):
         for digit in (2, 1, 0.5):
@@ -154,7 +156,7 @@ def choose_step(bounds: tuple[float, float, float, float]) -> float:
 
 
 def choose_altitudes(heights_m: np.ndarray) -> list[float]:
-    """Return three altitudes, 5 m apart, the lowest 10 m above 95 % of the roofs (n,) [m].
+    """Return three altitudes, 5 m apart, from 10 m above 95 % of the roofs (n,), at least 30 [m].
 
     So low, streets beside tall buildings have no line of sight, and few lattice positions lie
     inside a building.
@@ -168,9 +170,9 @@ def place_devices(count: int, grid: BuiltGrid, ground: CityMap | None, rng: np.r
                   ) -> list[DeviceConfig]:
     """Place devices on free ground, 10 m clear of buildings; three, or 30 %, are anchors.
 
-    Positions are drawn at random, with a probability by the built share of the surroundings, and
-    accepted if they are far enough from those before; that distance shrinks until all have room.
-    `ground` is a map without buildings; None: flat at the datum.
+    Anchors (devices of known position) are chosen far apart. Positions are drawn at random, more
+    often where more around them is built, and accepted if they are far enough from those before;
+    that distance shrinks until all have room. `ground` is a map without buildings; None: flat.
 
     Raises:
         BadInput: There is not enough free ground.
@@ -205,7 +207,10 @@ def place_devices(count: int, grid: BuiltGrid, ground: CityMap | None, rng: np.r
 
 
 def _spread_out(positions: np.ndarray, count: int) -> set[int]:
-    """Choose the position nearest to the middle, then each time the farthest from those chosen."""
+    """Return the indices of `count` positions (n, 2) that lie far apart.
+
+    The first is the nearest to the middle; each further one is the farthest from all chosen so far.
+    """
     chosen = [int(np.linalg.norm(positions - positions.mean(axis=0), axis=1).argmin())]
     gaps = np.linalg.norm(positions - positions[chosen[0]], axis=1)
     while len(chosen) < count:
@@ -216,10 +221,10 @@ def _spread_out(positions: np.ndarray, count: int) -> set[int]:
 
 def place_uavs(count: int, extent: Extent, lattice: LatticeConfig, buildings: CityMap | None,
                ground: CityMap | None = None) -> list[UavConfig]:
-    """Place UAVs, one altitude after another, at the free lattice position nearest to the middle.
+    """Place UAVs at the free lattice positions nearest to the middle, an altitude for each in turn.
 
-    They end where they start. The battery has 80 % of the moves along two sides of the extent, at
-    least 20.
+    They end where they start. The battery allows as many moves as 80 % of the lattice steps along
+    two sides of the extent, at least 20.
 
     Args:
         count: Number of UAVs.

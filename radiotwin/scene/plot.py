@@ -84,7 +84,7 @@ def plot_scene(scene: Scene, ax: Axes | None, geographic: bool | None) -> Axes:
 
 
 def draw_outlines(ax: Axes, scene: Scene, frame: PlotFrame) -> None:
-    """Draw the outlines of the buildings."""
+    """Draw the outlines of everything more than `BUILDING_M` above the ground."""
     grid_m = np.meshgrid(*_centres(scene, PLOT_CELLS))
     built = _above_ground_m(scene, grid_m) > BUILDING_M
     if built.any() and not built.all():
@@ -184,7 +184,7 @@ def _draw_contours(axes: Axes, scene: Scene) -> None:
 
 
 def draw_heights(axes: Axes, height_m: np.ndarray, bounds: Bounds) -> AxesImage:
-    """Draw heights (ny, nx), south first [m], with shaded relief."""
+    """Draw heights (ny, nx) [m], south first, over `bounds` [m] with shaded relief."""
     from matplotlib import colormaps
     from matplotlib.colors import LightSource
 

@@ -37,7 +37,7 @@ class _Element:
     properties: list[tuple[str, str, str | None]] = field(default_factory=list)
 
     def dtype(self, order: str, lengths: dict[str, int]) -> np.dtype:
-        """Return NumPy's type of one binary row whose lists have the given lengths."""
+        """Return NumPy's type of a binary row (`order`: byte order), given its lists' lengths."""
         fields: list[tuple] = []
         for name, kind, length_kind in self.properties:
             if length_kind is None:
@@ -52,7 +52,7 @@ class _Element:
         return name in {"vertex": tuple("xyz"), "face": _INDICES}.get(self.name, ())
 
     def add(self, name: str, kind: str, length_kind: str | None) -> None:
-        """Add a property; KeyError or ValueError if its type is unknown or cannot be of a mesh."""
+        """Add a property, a list if `length_kind` is given; KeyError, ValueError if impossible."""
         integers = {length_kind, kind if self.name == "face" and self.is_read(name) else None}
         if (any(one is not None and _TYPES[one].startswith("f") for one in integers)
                 or self.is_read(name) and (length_kind is None) != (self.name == "vertex")):
@@ -117,7 +117,7 @@ def _by_corners(path: Path, polygons: np.ndarray | _Lists) -> list[np.ndarray]:
 
 
 def _read_header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
-    """Return byte order ("": ASCII), elements, and the position where the data begin."""
+    """Parse a PLY header: byte order ("": ASCII), elements, and where the data begin."""
     end = data.find(b"end_header")
     if not data.startswith(b"ply") or end < 0:
         raise BadInput(f"{path} is not a PLY file, or it was cut off within its header; export "
@@ -176,7 +176,7 @@ def _truncated(path: Path, element: _Element, row: int) -> BadInput:
 
 
 def _read_ascii(path: Path, data: bytes, elements: list[_Element]) -> dict:
-    """Return (element, property) -> values of an ASCII file's data, needed properties only."""
+    """Return (element, property) -> values of an ASCII file; only vertices and faces are kept."""
     lines = [line for line in _lines(data) if line.strip()]
     columns: dict[tuple[str, str], array | _Lists] = {}
     first = 0
@@ -207,7 +207,7 @@ def _containers(element: _Element) -> dict[str, array | _Lists]:
 
 
 def _read_words(words: list[str], element: _Element, found: dict) -> None:
-    """Append the values of an ASCII row to the containers of its properties."""
+    """Append the values of an ASCII row to the lists in `found`, one for each needed property."""
     at = 0
     for name, kind, length_kind in element.properties:
         cast = float if kind.startswith("f") else int
@@ -230,7 +230,7 @@ def _read_words(words: list[str], element: _Element, found: dict) -> None:
 
 def _read_binary(path: Path, data: bytes, start: int, order: str, elements: list[_Element]
                  ) -> dict:
-    """Return (element, property) -> values of a binary file's data, needed properties only."""
+    """Return (element, property) -> values of a binary file; only vertices and faces are kept."""
     columns: dict[tuple[str, str], np.ndarray | array | _Lists] = {}
     for element in elements:
         found, start = (_read_uniform(data, start, order, element)
@@ -241,9 +241,9 @@ def _read_binary(path: Path, data: bytes, start: int, order: str, elements: list
 
 def _read_uniform(data: bytes, start: int, order: str, element: _Element
                   ) -> tuple[dict, int] | None:
-    """Read all rows of an element at once; None if their lists differ in length.
+    """Read all binary rows of an element at once: its values by property, and where they end.
 
-    Also returns the position behind them.
+    None if its lists differ in length, so that each row has to be read by itself.
     """
     if element.count == 0:
         return None
@@ -271,7 +271,11 @@ def _read_uniform(data: bytes, start: int, order: str, element: _Element
 
 def _read_ragged(path: Path, data: bytes, at: int, order: str, element: _Element
                  ) -> tuple[dict, int]:
-    """Read the rows of an element one by one; also return the position behind them."""
+    """Read the binary rows of an element one by one, as their lists differ in length.
+
+    Returns:
+        values of each property that is needed, and the position where the rows end.
+    """
     found = _containers(element)
     for row in range(element.count):
         try:

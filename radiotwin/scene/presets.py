@@ -72,7 +72,7 @@ class CityParameters:
 def draw_buildings(parameters: CityParameters, keep_free_m: np.ndarray, seed: int) -> np.ndarray:
     """Draw the buildings of a city at random: axis-aligned boxes, which may overlap.
 
-    No building comes closer than `clearance_m` to the points `keep_free_m` (k, 2) [m].
+    None comes closer than `clearance_m` to any of the points `keep_free_m` (k, 2) [m].
 
     Returns:
         (n, 5) x_min, y_min, x_max, y_max, height [m].
@@ -91,10 +91,10 @@ def draw_buildings(parameters: CityParameters, keep_free_m: np.ndarray, seed: in
 
 def _small_blocks(low: float, length_m: float, p: CityParameters, rng: np.random.Generator
                   ) -> list[tuple[float, float]]:
-    """Cut a side of a large block, from `low` on, into small blocks (start, end) between streets.
+    """Cut one side of a large block at random into small blocks with streets between them.
 
-    The piece behind the last street has at least the minimum length. All are clipped to the map,
-    0 to `length_m`.
+    The side begins at `low` and is an avenue spacing long. Returned are start and end of each small
+    block [m], clipped to the map (0 to `length_m`), without those too short for a building.
     """
     blocks, high = [], low + p.avenue_spacing_m
     while high - low >= 2 * p.block_min_m + p.street_width_m:
@@ -108,7 +108,11 @@ def _small_blocks(low: float, length_m: float, p: CityParameters, rng: np.random
 
 def _buildings_in(column: tuple[float, float], row: tuple[float, float], p: CityParameters,
                   keep_free_m: np.ndarray, rng: np.random.Generator) -> list[tuple]:
-    """Draw the buildings (x_min, y_min, x_max, y_max, height) [m] of one small block."""
+    """Draw the buildings (x_min, y_min, x_max, y_max, height) [m] of one small block at random.
+
+    The block spans `column` in x and `row` in y. Buildings are cut back from the points
+    `keep_free_m` (k, 2) [m], and dropped if a side becomes too short.
+    """
     (x0, x1), (y0, y1) = column, row
     boxes = []
     for _ in range(rng.poisson((x1 - x0) * (y1 - y0) * p.buildings_per_m2)):
@@ -128,7 +132,10 @@ def _buildings_in(column: tuple[float, float], row: tuple[float, float], p: City
 
 def _trim_clear(low: np.ndarray, high: np.ndarray, keep_free_m: np.ndarray, clearance_m: float
                 ) -> tuple[np.ndarray, np.ndarray]:
-    """Trim a rectangle to be clear of every point, each time at the side that costs least area."""
+    """Cut a rectangle back until it is `clearance_m` away from every point (k, 2) [m].
+
+    For each point, the side is moved that costs the least area.
+    """
     for point in keep_free_m:
         near, far = point - clearance_m, point + clearance_m
         if np.any(far <= low) or np.any(near >= high):

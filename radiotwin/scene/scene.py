@@ -136,7 +136,7 @@ class Scene(Summarised):
             step_m: Width of a cell [m].
 
         Returns:
-            Variable `height_m` (y, x) of the highest surface [m], 0 on the ground.
+            Variable `height_m` (y, x): height of the highest surface above z = 0 [m].
         """
         import xarray as xr
 
@@ -196,6 +196,7 @@ class Scene(Summarised):
 
     @property
     def _summary(self) -> Summary:
+        """Return the facts that are shown when a scene is printed."""
         config, (x_min, x_max, y_min, y_max) = self.config, self.config.extent.bounds
         anchors = sum(device.role == "anchor" for device in config.devices)
         size = f"{x_max - x_min:g} × {y_max - y_min:g} m"
@@ -212,9 +213,9 @@ class Scene(Summarised):
             ("lattice step", f"{config.lattice.step_m:g} m")))
 
     def _with_datum_heights(self) -> "Scene":
-        """Convert the devices' heights above the ground to heights above the datum.
+        """Return the scene with the heights of its devices above the datum instead of the ground.
 
-        A device without a declared height is `ANTENNA_HEIGHT_M` above the ground.
+        On terrain, a device without a declared height is `ANTENNA_HEIGHT_M` above the ground.
         """
         if self.config.terrain is None and all(device.above_ground_m is None
                                                for device in self.config.devices):
@@ -250,7 +251,7 @@ class Scene(Summarised):
 
     @cached_property
     def city(self) -> CityMap:
-        """3D map of the city, with its vegetation and terrain."""
+        """3D map of the city, with vegetation, terrain and standard deviations of heights."""
         terrain = self.config.terrain
         return CityMap.from_xml(self.xml_path, Vegetation.of(self.config.vegetation),
                                 None if terrain is None else terrain.shape,
@@ -258,7 +259,7 @@ class Scene(Summarised):
 
     @cached_property
     def lattice(self) -> Lattice:
-        """Positions that UAVs fly on."""
+        """Positions that UAVs fly on: at altitudes above the datum, or following the terrain."""
         declared = self.config.lattice
         lattice = Lattice.over(*self.config.extent.bounds, declared.step_m, declared.altitudes_m)
         if declared.above != "ground" or self.city.terrain is None:
@@ -267,9 +268,9 @@ class Scene(Summarised):
             *np.meshgrid(lattice.x_m, lattice.y_m)))
 
     def altitude_m(self, x_m: float, y_m: float, declared_m: float) -> float:
-        """Return the height above the datum of a declared altitude at x and y [m].
+        """Return the height above the datum z = 0 of a declared altitude at x and y [m].
 
-        It counts from the ground if the scene's lattice does.
+        If the scene's lattice counts altitudes from the ground, the ground's height is added.
         """
         if self.config.lattice.above != "ground":
             return declared_m
@@ -333,7 +334,7 @@ class Scene(Summarised):
             (folder / name).write_bytes(data)
 
     def copy(self, name: str, folder: Path) -> None:
-        """Copy a table of the scene folder into another one, where there is such a table.
+        """Copy a file of the scene folder, if there is one, into another folder.
 
         Raises:
             BadInput: A file outside the scene folder, or one that cannot be read.

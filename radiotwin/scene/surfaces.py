@@ -57,7 +57,7 @@ class Surfaces:
 
     @cached_property
     def free_edges(self) -> tuple[np.ndarray, np.ndarray]:
-        """(n, 2) edges with only one triangle, and (n,) the faces they belong to."""
+        """(n, 2) edges with only one triangle (border, holes), and (n,) that triangle's index."""
         edges, owner = self._edges()
         _, inverse, counts = np.unique(_edge_keys(np.sort(edges, axis=1)), return_inverse=True,
                                        return_counts=True)
@@ -70,7 +70,7 @@ class Surfaces:
         return edges, np.repeat(np.arange(len(self.faces)), 3)
 
     def _slices(self) -> Iterator[tuple[slice, slice]]:
-        """Yield the rows of faces and of vertices of each mesh."""
+        """Yield, for each mesh, the range of its faces and that of its vertices."""
         rows = np.searchsorted(self.shape, np.arange(self.shapes + 1))
         ends = [*self._starts[1:], len(self.vertices)]
         for first, last, start, end in zip(rows, rows[1:], self._starts, ends):
@@ -79,7 +79,8 @@ class Surfaces:
     def meshes(self, keep: np.ndarray | None = None) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return (vertices, faces) of each mesh, without unused vertices.
 
-        `keep`, (f,) bool, are the faces to keep, None: all. Meshes without any are left out.
+        Only faces that are True in `keep`, (f,) bool, are returned (None: all); meshes without any
+        are left out.
         """
         keep = np.ones(len(self.faces), dtype=bool) if keep is None else keep
         result = []
@@ -104,7 +105,7 @@ class Surfaces:
         return np.bincount(self.part, weights=values, minlength=self.parts)
 
     def part_bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the (parts, 3) lowest and highest coordinates of each part [m]."""
+        """Return the (parts, 3) lowest and highest coordinates of each connected part [m]."""
         face_low, face_high = self.face_bounds()
         low, high = np.full((self.parts, 3), np.inf), np.full((self.parts, 3), -np.inf)
         np.minimum.at(low, self.part, face_low)
@@ -134,7 +135,7 @@ class Surfaces:
         return closed
 
     def inconsistent_shapes(self) -> np.ndarray:
-        """Return the indices of meshes with neighbouring triangles of opposite orientation."""
+        """Return indices of meshes where two triangles at an edge face opposite sides."""
         edges, owner = self._edges()
         _, inverse, counts = np.unique(_edge_keys(edges), return_inverse=True, return_counts=True)
         _, pair, pairs = np.unique(_edge_keys(np.sort(edges, axis=1)), return_inverse=True,
@@ -144,9 +145,10 @@ class Surfaces:
     def inward(self) -> np.ndarray:
         """Return (f,) bool: faces to reverse so that solids face outwards and sheets upwards.
 
-        The flux of (x, y, 0) through a part is twice the volume it encloses, even without a flat
-        bottom, which would add nothing. Walls without a roof are judged by the flux of their whole
-        mesh: those of a courtyard rightly face inwards.
+        All faces of a connected part are reversed, or none. What decides is the sign of the flux of
+        the vector (x, y, 0) through the part, which is twice the volume it encloses; a missing flat
+        bottom would add nothing. Walls without a roof are judged by the flux of their whole mesh,
+        as those of a courtyard rightly face inwards; sheets by their area seen from above.
         """
         middle = np.stack([self.part_sum(self.areas * axis) for axis in self.centres.T], axis=1)
         offset = self.centres - (middle / self.part_sum(self.areas)[:, None])[self.part]
@@ -164,10 +166,10 @@ class Surfaces:
     def ground_faces(self) -> np.ndarray:
         """Return (f,) bool: faces of the ground (terrain, plane, streets).
 
-        Ground is a sheet or slab that covers at least 30 % of the city's plan, and whose mean
-        height is at most the median top of the other parts. Upward faces at the lowest level are
-        ground, too, if they cover as much (they may be connected to buildings). So are thin sheets
-        at the level of flat ground.
+        Ground is a connected sheet or slab that covers at least 30 % of the city's plan, and whose
+        mean height is at most the median top of the other parts. Upward faces at the lowest level
+        are ground, too, if they cover as much (they may be connected to buildings). So are thin
+        sheets at the level of flat ground, or below.
         """
         low, high = self.part_bounds()
         extent_m2 = np.prod(np.maximum((high.max(axis=0) - low.min(axis=0))[:2], 1e-9))
@@ -191,7 +193,10 @@ class Surfaces:
         return faces
 
     def level_m(self, faces: np.ndarray) -> float:
-        """Return the median height [m], weighted by area, of the faces (f,) bool that look up."""
+        """Return the median height [m], weighted by area, of the faces (f,) bool that look up.
+
+        If none of them does, all count.
+        """
         up = faces & (self.area_vectors[:, 2] > 0)
         up = up if up.any() else faces
         order = np.argsort(self.centres[up, 2])
@@ -199,7 +204,7 @@ class Surfaces:
         return float(self.centres[up, 2][order][np.searchsorted(area, area[-1] / 2)])
 
     def seams(self) -> np.ndarray:
-        """Return (n, 2) pairs of meshes: a roof of one shares an edge with a wall of the other."""
+        """Return pairs (n, 2) of meshes where an open edge of a wall meets one of a roof."""
         edges, owner = self.free_edges
         if len(edges) == 0:
             return np.zeros((0, 2), dtype=int)

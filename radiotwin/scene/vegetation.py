@@ -66,6 +66,8 @@ class Vegetation:
     def of(cls, declared: Sequence[VegetationConfig]) -> "Vegetation":
         """Make areas without overlaps from declared ones; self-crossing outlines are repaired.
 
+        Where two overlap, the higher one is kept.
+
         Raises:
             BadInput: the outlines have too many corners, or meet too often.
         """
@@ -132,7 +134,7 @@ class Vegetation:
 
     def _metres_on_terrain(self, a_m: np.ndarray, b_m: np.ndarray,
                            ground: GroundHeight) -> np.ndarray:
-        """Return `metres_through` over terrain, from samples along each link."""
+        """Return the length (n,) of links through vegetation on terrain [m], from samples."""
         through_m = np.zeros(len(a_m))
         if not len(self.areas):
             return through_m
@@ -159,7 +161,10 @@ class Vegetation:
 
 
 def _require_few_meetings(rings: list) -> None:
-    """Raise BadInput if rings have too many corners, or sides that meet, for shapely to process."""
+    """Raise BadInput if rings have too many corners, or too many of their sides cross or touch.
+
+    Otherwise shapely would take too much time and memory to repair them.
+    """
     corners = sum(map(len, rings))
     VEGETATION_CORNERS.check(corners, "the vegetation")
     if not corners:
@@ -171,7 +176,7 @@ def _require_few_meetings(rings: list) -> None:
 
 
 def count_meetings(sides: np.ndarray, at_once: int, check: Callable[[int], None]) -> int:
-    """Count the pairs of sides (n,) of rings that meet, without neighbours along a ring.
+    """Count the pairs of sides of polygons' rings that cross or touch, except neighbours on a ring.
 
     Args:
         sides: (n,) lines.
@@ -189,7 +194,7 @@ def count_meetings(sides: np.ndarray, at_once: int, check: Callable[[int], None]
 
 def _cut_to_height(a_m: np.ndarray, b_m: np.ndarray,
                    height_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cut links (a, b) to their parts between z = 0 and a height.
+    """Cut straight links (a, b) to their parts between z = 0 and a height [m].
 
     Returns:
         (m,) rows of the links that have such a part, and (m, 3) both ends of it [m].

@@ -81,7 +81,7 @@ class PackedCity:
 
     @classmethod
     def of(cls, shapes: Sequence[CityShape]) -> "PackedCity":
-        """Pack the shapes of a city."""
+        """Pack the shapes of a city into common arrays of vertices, faces and materials."""
         starts = np.cumsum([0, *(len(shape.mesh.vertices) for shape in shapes)])
         row = {material: index for index, material in
                enumerate(dict.fromkeys(shape.material for shape in shapes))}
@@ -124,7 +124,7 @@ class PackedCity:
         return shapely.dwithin(self._boxes, hull, tile.radius_m)
 
     def part(self, kept: np.ndarray) -> list[CityShape]:
-        """Return the shapes `kept`, (n,) bool, joined to one shape per material."""
+        """Return the shapes where `kept`, (n,) bool, is True, joined to one shape per material."""
         import trimesh
 
         shape = np.repeat(np.arange(len(self)), np.diff(self.first_face))
@@ -140,7 +140,11 @@ class PackedCity:
 
 
 def with_radius(scene: Scene, settings: SolverSettings) -> SolverSettings:
-    """Set the default culling radius for a scene of many shapes, unless a radius is given."""
+    """Return settings with the default culling radius, `RADIUS_M`, if the city has many shapes.
+
+    Geometry farther than the culling radius from the lines of sight is left out of tracing. Many
+    are more than `MANY_SHAPES` mesh files. A radius that is given stays; so does the solver `map`.
+    """
     if settings.solver != "paths" or settings.radius_m is not None:
         return settings
     folder = scene.folder / "meshes"
@@ -149,10 +153,10 @@ def with_radius(scene: Scene, settings: SolverSettings) -> SolverSettings:
 
 
 def longest_path_m(scene: Scene) -> float:
-    """Return the longest path that may matter [m]: longer ones can be left out.
+    """Return the length beyond which a path is too weak to matter, and can be left out [m].
 
-    Its free-space gain, with the peaks of the antennas, is `OMITTED_DB` below the limit of
-    detection. Interactions only take power away.
+    A path of this length in free space, at the peaks of both antennas, is `OMITTED_DB` below the
+    limit of detection; reflections and diffraction only weaken it.
     """
     peaks_dbi = [0.0 if antenna is None else antenna.pattern.peak_dbi
                  for antenna in scene.device_antennas]
@@ -164,10 +168,11 @@ def longest_path_m(scene: Scene) -> float:
 
 def tile_of(device_m: np.ndarray, points_m: np.ndarray, radius_m: float, longest_m: float
             ) -> Tile:
-    """Return the tile for links from a device (3,) to points (n, 3) [m].
+    """Return the tile, the part of a city to trace in, for links from a device to points (n, 3).
 
-    Its radius is `radius_m`, or less if all paths up to `longest_m` stay closer to the straight
-    lines of the links.
+    Positions are in metres. Shapes farther than the tile's radius from the convex hull of device
+    (3,) and points are left out. The radius is `radius_m`, or less if even paths of the length
+    `longest_m` stay closer to the straight line between their ends.
     """
     import shapely
 
@@ -220,7 +225,7 @@ class BatchStore:
                 temporary.write_text(text + "\n", encoding="utf-8")
 
     def get(self, piece: "LinkBatch") -> tuple[np.ndarray] | None:
-        """Return the gains of a batch in a tuple; None if they are absent or damaged."""
+        """Load the gains (n,) of a batch [dB] in a tuple of one; None if absent or damaged."""
         try:
             data = read_bytes(self.folder / f"{piece.name}.npy", "batch of a trace")
         except BadInput:
@@ -290,7 +295,8 @@ def link_pieces(scene: Scene, settings: SolverSettings,
                 size: int | None = None) -> tuple[list[LinkBatch], np.ndarray]:
     """Divide the links from several devices to the same points into batches.
 
-    Points are batched in their order; with tiles, by position.
+    Points are batched in their order; where only a part of the city (a tile) is traced, batches
+    are of neighbouring points.
 
     Args:
         scene: City, UAVs' antenna and limit of detection.
@@ -300,8 +306,8 @@ def link_pieces(scene: Scene, settings: SolverSettings,
         size: Maximum number of points in a batch; None: `settings.batch_receivers`.
 
     Returns:
-        The batches, device by device, and the indices (n,) of the points in the order of a device's
-        batches.
+        The batches, device by device, and the indices (n,) of the points in the order in which
+        each device's batches hold them.
     """
     size = size or settings.batch_receivers
     if settings.is_tiled:
@@ -382,7 +388,10 @@ class SolveCells(_BatchSolver):
 
 def link_job(scene: Scene, settings: SolverSettings,
              description: str) -> Job[LinkBatch, np.ndarray]:
-    """Return the job that solves batches; `description` is shown with its progress.
+    """Return the job for an executor: the function that traces a batch, and the memory it needs.
+
+    A batch of the solver `paths` that needs too much memory is halved. `description` is shown with
+    the progress.
 
     Raises:
         BadInput: The scene has antennas, and the solver is `map`.
@@ -398,7 +407,7 @@ def link_job(scene: Scene, settings: SolverSettings,
 
 
 def _resources(settings: SolverSettings, geometry_bytes: int = 0) -> Resources:
-    """Return the memory, and share of the GPU, that a worker needs."""
+    """Return the memory, and share of the GPU, that a worker needs to solve a batch."""
     memory_bytes = settings.memory_bytes() + geometry_bytes
     if settings.compute_device == "cpu":
         return Resources(memory_bytes)
@@ -438,11 +447,12 @@ def solve_lattice(scene: Scene, settings: SolverSettings, store: BatchStore, ind
 
 def solve_finer(scene: Scene, settings: SolverSettings, store: BatchStore, index: list[int],
                 executor: Executor) -> tuple[slice, np.ndarray, np.ndarray]:
-    """Trace a sample of a map's links with ten times the rays, in the same memory.
+    """Trace a sample of a map's links with ten times the rays, to estimate the numerical noise.
 
     The sample is 1 % of the positions (at least 8; drawn by the settings' seed) for all devices.
     With the solver `map`, which solves whole altitudes, it is the lowest altitude for the first
-    device. Arguments are those of `solve_lattice`.
+    device. A call has a tenth of the receivers, in the same memory. Arguments are those of
+    `solve_lattice`.
 
     Returns:
         Rows (devices) and columns (positions) of the map, and their gains (rows, columns) [dB].
@@ -465,7 +475,7 @@ def sample_size(scene: Scene) -> int:
 
 
 def exchanged_calls(scene: Scene, settings: SolverSettings, devices: int) -> int:
-    """Return the maximum number of solver calls in `solve_exchanged`, per antenna of devices."""
+    """Return the maximum of solver calls in `solve_exchanged`: a tenth of the map's, 8 to 50."""
     batches = devices * -(-len(scene.lattice.positions_m) // settings.batch_receivers)
     return min(sample_size(scene), max(MIN_EXCHANGED, min(MAX_EXCHANGED, batches // 10)))
 
@@ -474,13 +484,16 @@ def solve_exchanged(scene: Scene, settings: SolverSettings, store: BatchStore, i
                     executor: Executor, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Trace links with their ends exchanged: rays start at the receivers.
 
+    By reciprocity the gains should not change.
+
     Args:
         scene: City, devices, antennas and lattice.
         settings: Settings with the solver `paths`.
         store: Cache of the map's batches.
         index: Indices of the devices.
         executor: Where it runs.
-        columns: Indices of lattice positions to choose from, see `exchanged_calls`.
+        columns: Indices of lattice positions to choose from: evenly spaced ones are taken, about
+            as many as `exchanged_calls` allows.
 
     Returns:
         Indices of the positions that were solved, and their gains (devices, positions) [dB].
@@ -520,9 +533,9 @@ def _positions_per_altitude(scene: Scene) -> int:
 def lattice_pieces(scene: Scene, settings: SolverSettings, index: list[int],
                    columns: np.ndarray | None = None, label: str = ""
                    ) -> tuple[list[LinkBatch], np.ndarray]:
-    """Divide a map into batches; also return the order of the positions in them.
+    """Divide a map into batches; also return the order (n,) of the positions in them.
 
-    `columns` are the indices of the positions to trace (None: all). `label` is part of the batches'
+    `columns` are the indices of the positions to trace (None: all); `label` goes into the batches'
     names.
     """
     points_m = scene.lattice.positions_m if columns is None else scene.lattice.positions_m[columns]

@@ -51,7 +51,7 @@ def installed_version() -> str:
 
 
 def default_diffraction() -> Literal["reciprocal", "sionna"]:
-    """Return `reciprocal`; if another version of Sionna RT is installed, warn, return `sionna`."""
+    """Return `reciprocal` if the installed Sionna RT can be patched; else warn, return `sionna`."""
     if installed_version() == KNOWN_VERSION:
         return "reciprocal"
     warnings.warn(f"Sionna RT {installed_version()} is installed; its diffraction is used as it "
@@ -62,7 +62,11 @@ def default_diffraction() -> Literal["reciprocal", "sionna"]:
 
 @contextmanager
 def mended(diffraction: str) -> Iterator[None]:
-    """Patch Sionna RT within this context, if the diffraction is `reciprocal`."""
+    """Patch Sionna RT within this context, so that diffraction is the same in both directions.
+
+    Three of its methods are replaced, and restored at the end, see the module. If `diffraction` is
+    not `reciprocal`, nothing is changed.
+    """
     if diffraction != "reciprocal":
         yield
         return
@@ -97,7 +101,11 @@ def mended(diffraction: str) -> Iterator[None]:
 
 
 def _lengths_m(self: Any, paths: Any, source: Any, target: Any) -> Any:
-    """Return the path lengths after and before the diffraction, up to the last interaction."""
+    """Return the lengths of paths after and before their diffraction [m]; replaces Sionna RT's.
+
+    The first counts from the edge to `target`, the second from `source` to the edge. Depths behind
+    a path's last interaction are skipped; without diffraction, all is before.
+    """
     import drjit
     import mitsuba
     from sionna.rt.constants import InteractionType
@@ -121,6 +129,8 @@ def _lengths_m(self: Any, paths: Any, source: Any, target: Any) -> Any:
 def _wedge_matrix(self: Any, to_world: Any, direction_in: Any, direction: Any, si: Any,
                   permittivity: Any, wave_number: Any) -> Any:
     """Return the Jones matrix (4 x 4, real) of diffraction at a wedge; replaces Sionna RT's.
+
+    The coefficient is that of [1] for a wedge of exterior angle n π, with the reflections of [2].
 
     Args:
         self: Material of both faces, a slab.
@@ -189,9 +199,11 @@ def _wedge_matrix(self: Any, to_world: Any, direction_in: Any, direction: Any, s
 
 
 def _cotangent_term(beta: Any, x: Any, n: Any, sign: int) -> Any:
-    """Return cot((π + sign β) / 2n) F(x a(β)), finite at shadow boundaries [1, eq. 26-29].
+    """Return cot((π + sign β) / 2n) F(x a(β)), a term of the wedge's coefficient [1, eq. 26-29].
 
-    Both factors are computed from the angle to the boundary, so that single precision suffices.
+    β [rad] is the difference or sum of the angles of incidence and diffraction, n π the wedge's
+    exterior angle, and F the transition function. The cotangent is infinite where F is 0 (shadow
+    boundaries): both are computed from the angle to the boundary, so that their product is finite.
     """
     import drjit
 
@@ -205,7 +217,7 @@ def _cotangent_term(beta: Any, x: Any, n: Any, sign: int) -> Any:
 
 
 def _transition_over_root(root: Any) -> Any:
-    """Return F(x) / √x of √x [1, eq. 28]."""
+    """Return F(x) / √x for `root` = √x, with F the transition function [1, eq. 28]; finite at 0."""
     import drjit
     import mitsuba
     from sionna.rt.utils import f_utd

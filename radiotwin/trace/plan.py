@@ -66,7 +66,11 @@ class TracePlan:
     exchanged: int = 0
 
     def seconds(self, workers: int) -> float:
-        """Estimate the duration with some workers, each on a core like this machine's [s]."""
+        """Estimate how long the rest of the trace takes [s] with a number of workers.
+
+        Each has a core like this machine's. Counted are a worker's start, the unfinished batches,
+        10 % more for the noise estimate, and batches with exchanged ends.
+        """
         left = self.batches - self.finished
         if not left:
             return 0.0
@@ -94,7 +98,7 @@ class _Measured:
 
 def plan_trace(scene: Scene, settings: SolverSettings, devices: list[str] | None = None
                ) -> TracePlan:
-    """Estimate the cost of a map by solving a few batches, which the trace will use.
+    """Estimate the cost of a map by solving a few batches, which stay in the cache for the trace.
 
     One worker on one core solves a few batches that are drawn by the settings' seed. Batches over
     dense parts of a city take longer than others: the estimate is as good as the sample.
@@ -174,7 +178,7 @@ def choose_quality(scene: Scene, points_m: np.ndarray, target_db: float,
     160 links between the devices and the points outdoors are drawn by the settings' seed. They are
     solved with each quality, from the fewest rays on, and again with ten times its rays, until the
     RMS difference of detected links is within the target. `noise_floor_db` of a traced map is the
-    same figure for 1 % of the map. Within `keep_pieces`, each quality's gains are kept.
+    same figure for 1 % of the map. In the context `keep_pieces`, each quality's gains are cached.
 
     Args:
         scene: City, devices and radio.
@@ -218,7 +222,10 @@ def choose_quality(scene: Scene, points_m: np.ndarray, target_db: float,
 
 def _draw_calls(points_m: np.ndarray, index: Sequence[int], seed: int
                 ) -> list[tuple[int, np.ndarray]]:
-    """Draw the links of the pilot: (device, points) of each call of the solver."""
+    """Draw the links on which qualities are compared: device and points (n, 3) of each solver call.
+
+    The same seed, number of points and devices give the same links.
+    """
     rng = np.random.default_rng([seed, len(points_m), *index])
     devices = np.resize(rng.permutation(index), _CALLS)
     count = min(_POINTS, len(points_m))
@@ -228,7 +235,7 @@ def _draw_calls(points_m: np.ndarray, index: Sequence[int], seed: int
 
 def _try_quality(scene: Scene, quality: str, settings: SolverSettings,
                  calls: list[tuple[int, np.ndarray]]) -> Rung:
-    """Solve the pilot's links with a quality, and with ten times its rays, and compare them."""
+    """Solve sampled links with a quality and with ten times its rays, and compare the gains."""
     solved = [kept("pilot", (scene.content_hash(), one.attributes(), *calls),
                    partial(_solve_pilot, scene, one, calls),
                    lambda found: ({"found": found}, None), lambda arrays, _: arrays["found"])
@@ -247,7 +254,7 @@ def _try_quality(scene: Scene, quality: str, settings: SolverSettings,
 
 def _solve_pilot(scene: Scene, settings: SolverSettings, calls: list[tuple[int, np.ndarray]]
                  ) -> np.ndarray:
-    """Return the gains of all calls [dB], NaN where not detected, then the seconds a link."""
+    """Return the sampled links' gains [dB] (NaN: not detected), and, last, the seconds per link."""
     solver = PathGains(scene.xml_path, scene.config.radio.frequency_hz, settings)
     gains, seconds = [], []
     for device, points_m in calls:

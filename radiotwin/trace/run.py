@@ -69,7 +69,8 @@ def check_gains(gain_db: np.ndarray, los: np.ndarray, distance_m: np.ndarray, fr
     """Check traced gains against bounds by physics.
 
     With antennas, an LoS link is at least as strong as its direct path, and at most as if all paths
-    left and arrived at the antennas' peaks.
+    left and arrived at the antennas' peaks. The median of LoS links over free space must lie within
+    `MEDIAN_EXCESS_DB`, and hardly any link below `MIN_EXCESS_DB`.
 
     Args:
         gain_db: (n,) gains [dB]; NaN: no path.
@@ -85,7 +86,7 @@ def check_gains(gain_db: np.ndarray, los: np.ndarray, distance_m: np.ndarray, fr
         Figures for the map's attributes.
 
     Raises:
-        RunFailed: A gain above 0 dB, no path at all, or LoS links that are far from free space.
+        RunFailed: A gain above 0 dB, no path at all, or LoS links outside these bounds.
     """
     found = np.isfinite(gain_db)
     if not found.any():
@@ -144,10 +145,10 @@ def noise_figures(gain_db: np.ndarray, finer_db: np.ndarray) -> dict[str, float 
 
 def exchange_figures(gain_db: np.ndarray, exchanged_db: np.ndarray, los: np.ndarray
                      ) -> dict[str, float]:
-    """Compare gains with those of exchanged ends, both (n,) [dB] with NaN where not detected.
+    """Compare gains with those traced from the other end of each link, both (n,) [dB].
 
     By reciprocity they are equal. A difference is an error of the traced map: paths that the rays
-    of one end miss, and diffraction that is not reciprocal.
+    of one end miss, or diffraction that is not reciprocal. NaN is not detected.
 
     Returns:
         Attributes of the map, over links detected in both: RMS of the difference for LoS (`los`,
@@ -167,12 +168,15 @@ def exchange_figures(gain_db: np.ndarray, exchanged_db: np.ndarray, los: np.ndar
 
 
 def detected(gain_db: np.ndarray, limit_db: float) -> np.ndarray:
-    """Set gains below the limit of detection, and impossible ones, to NaN."""
+    """Set gains [dB] below the limit of detection, and impossible ones (infinite), to NaN."""
     return np.where((gain_db < limit_db) | (gain_db == IMPOSSIBLE_DB), np.nan, gain_db)
 
 
 def truth_path(scene: Scene, devices: list[str] | None = None) -> Path:
-    """Return the default file of a scene's traced map."""
+    """Return the default file of a scene's traced map: `truth.nc` in its folder.
+
+    For chosen devices it is `truth-NAME-NAME.nc`, with a digest where that is too long.
+    """
     name = "-".join(["truth", *(devices or [])])
     if len(name) > MAX_STEM:  # the digest tells apart names that are cut at the same place
         digest = hashlib.sha256(name.encode()).hexdigest()[:12]
@@ -282,7 +286,8 @@ def warn_of_terrain(city: CityMap, device_m: np.ndarray, positions_m: np.ndarray
                     no_path: np.ndarray) -> None:
     """Warn of links that Sionna RT cannot trace: behind terrain, or beyond the horizon.
 
-    `no_path`, (devices, positions) bool, are the links without a path.
+    Behind terrain are links of `no_path`, (devices, positions) bool, that the ground blocks; for
+    the horizon, all links longer than `FAR_M` count, as Sionna RT's Earth is flat.
     """
     hidden = far = 0
     for point_m, missed in zip(device_m, no_path, strict=True):
@@ -301,7 +306,7 @@ def warn_of_terrain(city: CityMap, device_m: np.ndarray, positions_m: np.ndarray
 
 
 def _antenna_gains(scene: Scene, index: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the gain of both antennas along the straight lines of links, and their peaks.
+    """Return the gain of both antennas along the straight line of each link, and their peaks.
 
     Returns:
         (devices, positions) gains of both ends together, and (devices, 1) peaks [dBi].
@@ -319,7 +324,7 @@ def _antenna_gains(scene: Scene, index: list[int]) -> tuple[np.ndarray, np.ndarr
 
 
 def _finished_map(path: Path, trace_hash: str, devices: list[str]) -> RadioMap | None:
-    """Load the map at `path` if it is finished, of this trace and these devices; else None."""
+    """Load the map at `path` if it has the same hash of its inputs, and devices; else None."""
     if not path.exists():
         return None
     try:
@@ -349,7 +354,7 @@ def device_indices(scene: Scene, devices: list[str] | None) -> list[int]:
 
 
 def open_store(scene: Scene, settings: SolverSettings) -> BatchStore:
-    """Open the cache of a scene's map with these settings, in the scene folder.
+    """Open the cache of finished batches for a scene's map with these settings, in its folder.
 
     Raises:
         BadInput: The folder lies outside the scene's, or cannot be written.
@@ -363,7 +368,11 @@ def open_store(scene: Scene, settings: SolverSettings) -> BatchStore:
 
 def _censor_gains(raw_db: np.ndarray, inside: np.ndarray, impossible: np.ndarray, limit_db: float
                   ) -> tuple[np.ndarray, dict[str, int]]:
-    """Set gains that are not detected to NaN, and count the links by reason."""
+    """Set gains that are not detected to NaN, and count the links by reason.
+
+    A link is not detected without a path, below `limit_db`, or at a position inside a building
+    (`inside`, (positions,) bool). `raw_db` and `impossible` are (devices, positions).
+    """
     within = np.broadcast_to(inside, raw_db.shape)
     no_path = np.isnan(raw_db) & ~within & ~impossible
     below = ~within & (raw_db < limit_db)
@@ -382,7 +391,7 @@ def trace_gains(scene: Scene, device_m: np.ndarray, points_m: np.ndarray, settin
                 executor: Executor | None = None) -> np.ndarray:
     """Trace the gains between any positions; receivers have the antenna of the scene's UAVs.
 
-    Within `keep_pieces`, each finished batch is kept.
+    In the context `keep_pieces`, finished batches are cached and not solved again.
 
     Args:
         scene: City and frequency.

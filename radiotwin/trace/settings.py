@@ -112,7 +112,7 @@ class SolverSettings:
 
     @classmethod
     def of_quality(cls, quality: str = "default", **others: Any) -> "SolverSettings":
-        """Return the settings of a quality.
+        """Return the settings of a quality; the solver `map` gets 100 times its rays.
 
         Args:
             quality: `fast`, `default` or `high`.
@@ -134,7 +134,7 @@ class SolverSettings:
                        batch_receivers=max(1, self.batch_receivers // factor))
 
     def memory_bytes(self) -> int:
-        """Return the maximum memory of a process that solves batches; 0: not known (`map`)."""
+        """Return the most memory [bytes] that solving a batch takes; 0: not known (`map`)."""
         if self.solver == "map":
             return 0
         rays = self.max_depth * self.samples_per_src * self.batch_receivers
@@ -144,8 +144,8 @@ class SolverSettings:
         """Return everything that a gain depends on, as attributes of a NetCDF file.
 
         `compute_device` is left out for processors: their maps are the same on every machine.
-        `wedge` is only there for `reciprocal`: a map with `diffraction` 1 and no `wedge` has Sionna
-        RT's own. NetCDF has no booleans: they are 0 and 1.
+        `wedge` (the model of edges) is only there for `reciprocal`: a map with `diffraction` 1 and
+        no `wedge` has Sionna RT's own. NetCDF has no booleans: they are 0 and 1.
         """
         found = {name: int(value) if isinstance(value, bool) else value
                  for name, value in asdict(self).items()

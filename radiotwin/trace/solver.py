@@ -59,7 +59,7 @@ def library_versions() -> dict[str, str]:
 
 
 def import_sionna(device: Device = "cpu") -> Any:
-    """Import `sionna.rt` for the processor (`cpu`, with a working libLLVM) or a GPU (`cuda`).
+    """Import and return `sionna.rt` for the processor (`cpu`, by libLLVM) or a GPU (`cuda`).
 
     A process cannot change from one to the other.
 
@@ -87,7 +87,7 @@ def import_sionna(device: Device = "cpu") -> Any:
 
 
 def _set_variant(mitsuba: Any, device: Device) -> None:
-    """Set Mitsuba's variant for a device; RunFailed if that is impossible in this process."""
+    """Select Mitsuba's variant for the processor or GPU; RunFailed if that is impossible."""
     wanted, used = _VARIANTS[device], mitsuba.variant()
     if used is None:
         try:
@@ -103,9 +103,10 @@ def _set_variant(mitsuba: Any, device: Device) -> None:
 def load_city(city: City, frequency_hz: float, device: Device = "cpu") -> Any:
     """Load a city into Sionna RT, with vertically polarised isotropic antennas at both ends.
 
-    Mitsuba's parser, which can load other files and plugins, gets a copy written from the parsed
-    shapes, not the scene's own file. ITU materials outside their frequency range keep the constants
-    at its nearest end, with a warning.
+    The city is a `city.xml`, shapes, or None for empty space. Mitsuba's parser, which can load
+    other files and plugins, gets a copy written from the parsed shapes, not the scene's own file.
+    ITU materials outside their frequency range keep the constants at its nearest end, with a
+    warning.
 
     Raises:
         BadInput: The file cannot be read.
@@ -123,7 +124,7 @@ def load_city(city: City, frequency_hz: float, device: Device = "cpu") -> Any:
 
 
 def _load_copy(rt: Any, city: Path | str | Sequence[CityShape]) -> Any:
-    """Write a copy of a city, with flat ground as a half space, and load it into Sionna RT."""
+    """Load a copy of a city into Sionna RT, with flat ground so thick that it is a half space."""
     shapes = read_city(city) if isinstance(city, Path | str) else city
     with scratch_folder() as folder:
         write_city(folder, [_as_half_space(shape) if _is_flat_ground(shape) else shape
@@ -151,7 +152,7 @@ def _as_half_space(ground: CityShape) -> CityShape:
 
 
 def _hold_in_range(material: Any, frequency_hz: float) -> None:
-    """Fix the constants of an ITU material outside its frequency range, with a warning."""
+    """Use an ITU material's constants at the nearest end of its frequency range, with a warning."""
     epsilon, conductivity, in_range = permittivity(material.itu_type, frequency_hz)
     if in_range:
         return
@@ -164,10 +165,11 @@ def _hold_in_range(material: Any, frequency_hz: float) -> None:
 
 @contextmanager
 def candidate_search(table_size: int, diffraction_probability: float) -> Iterator[None]:
-    """Set two constants of Sionna RT's path search within this context.
+    """Set two constants of Sionna RT's path search, for which it has no arguments, in this context.
 
-    They are `TABLE_SIZE` and `DIFFRACTION_PROBABILITY` of `radiotwin.trace.settings`; Sionna RT has
-    no arguments for them.
+    They are the entries of the hash table of candidate paths, and the probability that a ray that
+    meets an edge is diffracted; see `TABLE_SIZE` and `DIFFRACTION_PROBABILITY` in
+    `radiotwin.trace.settings`.
     """
     from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator as Search
 
@@ -182,11 +184,11 @@ def candidate_search(table_size: int, diffraction_probability: float) -> Iterato
 
 def distinct_paths(interactions: np.ndarray, vertices_m: np.ndarray, length_m: np.ndarray,
                    strength: np.ndarray, cos_turn: np.ndarray) -> np.ndarray:
-    """Return a mask of the paths of links without duplicates.
+    """Return which paths of each link count, each distinct path once, as a mask.
 
     Paths are duplicates if they have the same interactions in the same order at the same points,
-    and the same length; the strongest is kept. Paths of equal length over different points (two
-    walls at equal distances) are kept. A link has one direct path.
+    and the same length: the strongest counts. Paths of equal length over different points (two
+    walls at equal distances) both count. Of a link's direct paths the straightest counts.
 
     Args:
         interactions: (depth, n, k) types of interactions of k paths of n links, 0: none.
@@ -194,7 +196,7 @@ def distinct_paths(interactions: np.ndarray, vertices_m: np.ndarray, length_m: n
         length_m: (n, k) length [m]; not positive where there is no path.
         strength: (n, k) magnitude of the field.
         cos_turn: (n, k) cosine of the angle between the directions of departure and of arrival,
-            -1 for a straight line. A blank candidate has no direction of departure.
+            -1 for a straight line, as a direct path has it unless Sionna RT failed to store it.
 
     Returns:
         (n, k) bool.
@@ -290,7 +292,7 @@ class PathGains:
 
     def _solve(self, device_m: np.ndarray, points_m: np.ndarray, antennas: Antennas, seed: int
                ) -> np.ndarray:
-        """Return the gains of one call; `IMPOSSIBLE_DB` where a gain exceeds its bound."""
+        """Return the gains (n,) of one call [dB]; `IMPOSSIBLE_DB` above the upper bound."""
         import drjit
 
         settings = self.settings
@@ -315,14 +317,19 @@ class PathGains:
 
     def gains(self, device_m: np.ndarray, points_m: np.ndarray, antennas: Antennas = (None, None)
               ) -> np.ndarray:
-        """Return the gains of any number of points (n, 3), batch by batch; see `solve`."""
+        """Return the gains (n,) of links to any number of points, by batches; see `solve`."""
         gain_db = np.full(len(points_m), np.nan)
         for part in self.batches(len(points_m)):
             gain_db[part] = self.solve(device_m, points_m[part], antennas)
         return gain_db
 
     def _combine(self, paths: Any, antennas: Antennas) -> tuple[np.ndarray, np.ndarray]:
-        """Return received over transmitted power (batch_receivers,), and its upper bound."""
+        """Return received over transmitted power (batch_receivers,), and its upper bound.
+
+        Each distinct path is weighted with the antennas' gains; powers, or fields with their
+        phases, are added as the settings say. The bound takes every path as free space over its
+        length, at the antennas' peaks.
+        """
         n = self.settings.batch_receivers
 
         def by_link(values: Any) -> np.ndarray:
@@ -348,7 +355,7 @@ class PathGains:
                 _exact_sums(limit) ** 2)
 
     def _counted(self, paths: Any, strength: np.ndarray, cos_turn: np.ndarray) -> np.ndarray:
-        """Return `distinct_paths` of Sionna RT's paths, (n, k) bool."""
+        """Return which of Sionna RT's paths are distinct, (links, paths) bool."""
         interactions = np.array(paths.interactions)
         interactions = interactions.reshape(len(interactions), *strength.shape)
         vertices_m = np.array(paths.vertices).reshape(*interactions.shape, 3)
@@ -379,7 +386,7 @@ class CellGains:
         self._city.add(self._transmitter)
 
     def solve(self, device_m: np.ndarray, z_m: float) -> np.ndarray:
-        """Return the gains (ny * nx,) at one altitude [dB]; NaN where no ray passed."""
+        """Return the gains (ny * nx,) of cells at an altitude [dB]; NaN where no ray passed."""
         import drjit
 
         settings, lattice = self.settings, self.lattice

@@ -98,7 +98,7 @@ Bounds = tuple[float, float, float, float]
 
 def _building_table(prisms: Sequence[Prism], shape_of: Mapping[int, str],
                    on_terrain: bool = False) -> pd.DataFrame:
-    """Return the table of buildings, one row per prism.
+    """Return the table of buildings, one row per prism (a building, or a part with its own height).
 
     Columns are building, shape, x_m, y_m (a point inside), area_m2, on terrain ground_m (the lowest
     ground under the building), bottom_m and top_m (above the datum), height_from, height_sd_m (see
@@ -128,7 +128,7 @@ def _building_table(prisms: Sequence[Prism], shape_of: Mapping[int, str],
 
 
 def check_map_options(options: BuildOptions) -> None:
-    """Raise BadInput for a value that is impossible for a map."""
+    """Raise BadInput if an option for building a scene from a map has an impossible value."""
     with_materials(options.material_table, options.materials or {})
     height_m = options.default_height_m
     if height_m is not None and not 0 < height_m <= MAX_HEIGHT_M:
@@ -149,7 +149,7 @@ def check_map_options(options: BuildOptions) -> None:
 
 
 def _declared_column(options: BuildOptions) -> HeightColumn | None:
-    """Return the column of heights that the user named; None if there is none."""
+    """Return the column of heights that the user named, with that of the ground; else None."""
     if options.height_column is not None:
         return declared_column(options.height_column, options.ground_column)
     if options.ground_column is not None:
@@ -280,7 +280,7 @@ def build_scene_from_map(
 
 def _unused_fact(found: MapFile, features: list[Feature], materials: MaterialTable,
                  declared: HeightColumn | None) -> tuple[tuple[str, str], ...]:
-    """Return the report's line on tags, columns and layers that are not used."""
+    """Return a row of the report (subject, text) on tags, columns and layers not used, or ()."""
     used = READ_COLUMNS | READ_TAGS | set(materials.by_tag) | (
         {declared.name, declared.ground} if declared else set())
     names = {key for feature in features for key in feature.tags} | {
@@ -292,10 +292,10 @@ def _unused_fact(found: MapFile, features: list[Feature], materials: MaterialTab
 
 def _default_height_problems(prisms: list[Prism], features: list[Feature],
                              default_height_m: float | None, path: Path) -> list[Problem]:
-    """Return a warning if buildings have the default height, and the user did not give one.
+    """Return a warning if buildings have the default height, and the user did not choose it.
 
     Raises:
-        BadInput: all buildings of a table have it, though the table has other numeric columns.
+        BadInput: all buildings of a table have it, though one of its columns may hold heights.
     """
     buildings = {prism.name for prism in prisms}
     guessed = {prism.name for prism in prisms if prism.height.source == "default"}
@@ -312,7 +312,7 @@ def _default_height_problems(prisms: list[Prism], features: list[Feature],
 
 def _check_unit(prisms: list[Prism], plan_m: float, declared: HeightColumn | None,
                 path: Path) -> None:
-    """Raise BadInput if the plan is in feet, and heights of a column may be in feet or metres."""
+    """Raise BadInput if the plan is in feet and a height column could be in feet or in metres."""
     unit_unknown = {column.name for column in KNOWN if column.unit == "m" and not column.ground
               and not column.name.endswith("_m")} - ({declared.name} if declared else set())
     used = sorted({prism.height.source for prism in prisms} & unit_unknown)
@@ -323,7 +323,7 @@ def _check_unit(prisms: list[Prism], plan_m: float, declared: HeightColumn | Non
 
 
 def _features_in_box(features: list[Feature], bbox_deg: Bounds | None, path: Path) -> list[Feature]:
-    """Return the features that reach into the box; of a 3D model, with all parts of the building.
+    """Return the buildings that reach into the box (None: all); of 3D models, with all parts.
 
     Raises:
         BadInput: coordinates that are no degrees, too intricate outlines, or none in the box.
@@ -365,7 +365,7 @@ def _features_in_box(features: list[Feature], bbox_deg: Bounds | None, path: Pat
 
 
 def _middle_of(features: list[Feature], bbox_deg: Bounds | None) -> Origin:
-    """Return the middle of the box (south, west, north, east) [degrees], or of the buildings."""
+    """Return the middle of the box (south, west, north, east) [degrees]; None: of all buildings."""
     if bbox_deg is None:
         bounds = np.array([feature.area.bounds for feature in features])
         finite = np.isfinite(bounds)
@@ -378,7 +378,7 @@ def _middle_of(features: list[Feature], bbox_deg: Bounds | None) -> Origin:
 
 
 def _bounds_m(prisms: list[Prism], origin: Origin, bbox_deg: Bounds | None) -> Bounds:
-    """Return (x_min, x_max, y_min, y_max) of the box, or of the buildings [m]."""
+    """Return (x_min, x_max, y_min, y_max) [m] of a box in degrees; None: of all buildings."""
     if bbox_deg is not None:
         south, west, north, east = bbox_deg
         x_m, y_m = to_local(origin, np.array([west, east, west, east]),
@@ -398,7 +398,7 @@ def _enclosing_box(one_m: Bounds, other_m: Bounds) -> Bounds:
 
 
 def _check_sizes(features: list[Feature], origin: Origin, path: Path) -> None:
-    """Raise BadInput if a building, or the whole map, is too wide for a plane."""
+    """Raise BadInput if a building, or the whole map, is too wide for a flat local frame."""
     bounds = np.array([feature.area.bounds for feature in features])
     middle = [origin.longitude_deg, origin.latitude_deg]
     bounds = np.where(np.isfinite(bounds), bounds, [middle * 2])
@@ -427,7 +427,7 @@ def _overlap_problems(prisms: list[Prism], contacts: Contacts) -> list[Problem]:
 
 
 def _ground_box(prisms: list[Prism], extent_m: Bounds) -> Bounds:
-    """Return (x_min, x_max, y_min, y_max) [m] of the ground: buildings and extent with a margin."""
+    """Return x_min, x_max, y_min, y_max [m] of the ground: all buildings, extent and a margin."""
     bounds = np.array([prism.area.bounds for prism in prisms])
     x0, y0 = np.minimum(bounds[:, :2].min(axis=0), extent_m[::2]) - GROUND_MARGIN_M
     x1, y1 = np.maximum(bounds[:, 2:].max(axis=0), extent_m[1::2]) + GROUND_MARGIN_M
@@ -438,7 +438,11 @@ def _assemble_city(
     prisms: list[Prism], contacts: Contacts, ground: Ground, table: MaterialTable,
     problems: list[Problem],
 ) -> tuple[ImportedCity, dict[int, str]]:
-    """Return the city with its ground, and index of a prism -> name of its shape."""
+    """Return the city of ground and buildings, and index of a prism -> name of its shape.
+
+    Prisms (buildings or their parts) of one material that touch become one shape; roofs are shapes
+    of their own if the table gives them a material. `problems` gets one for open meshes.
+    """
     names, meshes = [GROUND], [(ground.vertices, ground.faces)]
     materials: list[Material | None] = [itu_material(table.ground)]
     taken = Names({*RESERVED_NAMES, GROUND})

@@ -122,7 +122,7 @@ def city_features(path: Path, objects: Sequence[CityObject], systems: Sequence[s
 
 
 def _building_name(one: CityObject, by_name: Mapping[str, CityObject]) -> str:
-    """Return the name of the building that an object belongs to.
+    """Return the name of the building that an object belongs to: its outermost built parent.
 
     A group of buildings (CityObjectGroup), which has them as children, does not count.
     """
@@ -139,7 +139,7 @@ def _building_name(one: CityObject, by_name: Mapping[str, CityObject]) -> str:
 def _best_geometries(one: CityObject, lowest_lod: int) -> list[Geometry]:
     """Return the geometries of the best level of detail: the highest below 3, else the lowest.
 
-    `lowest_lod` 1 selects among surfaces (LoD 1 and more), 0 among outlines.
+    `lowest_lod` 1 considers surfaces in space (LoD 1 and more) only, 0 outlines only.
     """
     usable = [geometry for geometry in one.geometries
               if any(len(ring) for polygon in geometry.polygons for ring in polygon)
@@ -152,7 +152,7 @@ def _best_geometries(one: CityObject, lowest_lod: int) -> list[Geometry]:
 
 
 def _other_objects(objects: Sequence[CityObject]) -> list[Problem]:
-    """Return a warning that counts the objects that are neither buildings nor bridges."""
+    """Return a warning that counts the objects that are neither buildings nor bridges; or []."""
     counts: dict[str, int] = {}
     for one in objects:
         if one.kind not in BUILT and one.geometries:
@@ -165,7 +165,7 @@ def _other_objects(objects: Sequence[CityObject]) -> list[Problem]:
 
 
 def _one_system(path: Path, names: Sequence[str], crs: str | None) -> "CRS":
-    """Return the coordinate reference system of a file; BadInput if it names different ones."""
+    """Return the coordinate reference system that `names` and `crs` mean; BadInput if several."""
     chosen_system(path, names[0], crs)
     systems = [find_city_system(path, name) for name in dict.fromkeys(names)]
     for name, other in zip(dict.fromkeys(names), systems):
@@ -194,7 +194,7 @@ def _in_degrees(path: Path, geometries: Sequence[Geometry], system: "CRS") -> li
 
 def _features(chosen: list[tuple[CityObject, str, list[Geometry]]], points: list[np.ndarray],
               by_name: Mapping[str, CityObject]) -> list[Feature]:
-    """Return a feature for each chosen geometry.
+    """Return a feature for each chosen geometry, an outline or a shell of surfaces, with tags.
 
     Args:
         chosen: objects, names of their buildings, and their geometries.
@@ -228,7 +228,7 @@ def _ring_indices(geometry: Geometry) -> list[list[np.ndarray]]:
 
 
 def _outline(geometry: Geometry, known: np.ndarray) -> shapely.MultiPolygon:
-    """Return the area of an outline (LoD 0) with corners (n, 3), in degrees."""
+    """Return an outline (LoD 0) as polygons in degrees; `known` are its corners (n, 3)."""
     polygons = []
     for rings in _ring_indices(geometry):
         loops = [known[ring, :2] for ring in rings if len(ring) > 2]

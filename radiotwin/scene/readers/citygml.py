@@ -44,7 +44,7 @@ _MAX_VALUE = 1000  # characters of an attribute
 
 
 def read_citygml(path: Path, crs: str | None = None) -> MapFile:
-    """Read the surfaces of buildings in a CityGML file; outlines of those without surfaces.
+    """Read the buildings of a CityGML file with their surfaces; those without, with outlines.
 
     Args:
         path: CityGML file.
@@ -72,7 +72,10 @@ class _Surfaces:
     referring: set[float] = field(default_factory=set)  # levels with a solid that names surfaces
 
     def geometries(self) -> list[Geometry]:
-        """Return one geometry per level: the solid, or the surfaces that it refers to."""
+        """Return one geometry per level of detail: the solid, else the other surfaces.
+
+        A solid that is empty, or refers to surfaces (`xlink:href`), gets the others in addition.
+        """
         found, others = [], self.roof_edges | self.others
         for lod in sorted({*self.solids, *others}):
             solid, other = self.solids.get(lod), others.get(lod)
@@ -109,7 +112,7 @@ class _Reader:
         self.line = 0
 
     def start(self, tag: str, attributes: dict[str, str], line: int) -> None:
-        """Begin an element: skip it, open an object, or note its geometry or attribute."""
+        """Begin an XML element: skip it, open an object, or note what the open object has in it."""
         name = tag.rpartition(":")[2]
         self.tags.append(name)
         depth, self.line = len(self.tags), line
@@ -129,7 +132,7 @@ class _Reader:
             self._content(name, attributes, depth)
 
     def _note_system(self, attributes: dict[str, str]) -> None:
-        """Note a coordinate reference system, and the dimension of positions from here on."""
+        """Note the coordinate reference system and the dimension that an element declares."""
         system = attributes.get("srsName")
         if system and system not in self.systems and len(self.systems) < _MAX_SYSTEMS:
             self.systems.append(system)
@@ -147,7 +150,7 @@ class _Reader:
         self.open.append((depth, made, _Surfaces()))
 
     def _content(self, name: str, attributes: dict[str, str], depth: int) -> None:
-        """Begin an element within an object: level of detail, surface, polygon, or a value."""
+        """Begin an element within an object: level of detail, wall or roof, polygon, or value."""
         surfaces = self.open[-1][2]
         if found := _LOD.fullmatch(name):
             self.lod = depth, float(found[1]), "Solid" in found[2]
@@ -166,7 +169,7 @@ class _Reader:
             self.text, self.unit = [], attributes.get("uom", "")
 
     def add_text(self, text: str) -> None:
-        """Collect the text of positions or of a value."""
+        """Collect a piece of text, if the open element holds positions or a value."""
         if self.text is not None:
             self.text.append(text)
             self.text_length += len(text)
@@ -174,7 +177,7 @@ class _Reader:
                 TAG_BYTES.check(self.text_length, f"{self.path}, line {self.line}")
 
     def end(self, tag: str) -> None:
-        """End an element: store its positions, polygon, value or object."""
+        """End an XML element: store the positions, polygon or value in it, or close its object."""
         name, depth = self.tags[-1], len(self.tags)
         self.tags.pop()
         if self.dimensions and self.dimensions[-1][0] == depth:
@@ -202,7 +205,7 @@ class _Reader:
             made.geometries = surfaces.geometries()
 
     def _end_of_geometry(self, name: str, dimension: int) -> None:
-        """Store positions, a ring, or a polygon with its rings."""
+        """End positions (add to the ring), a ring (add to the polygon) or a polygon (store it)."""
         assert self.rings is not None
         if self.text is not None:
             self._add_numbers("".join(self.text), dimension)
@@ -226,7 +229,10 @@ class _Reader:
             self.rings = None
 
     def _add_numbers(self, text: str, dimension: int) -> None:
-        """Parse a list of positions of 2 or 3 numbers; BadInput if it is another text."""
+        """Append the coordinates in a text to those of the open ring, with z = 0 in two dimensions.
+
+        BadInput if the text is no list of positions of `dimension` (2 or 3) numbers.
+        """
         try:
             # `coordinates` of GML 2 has `x,y,z x,y,z`
             numbers = [float(word) for word in text.replace(",", " ").split()]
@@ -243,7 +249,10 @@ class _Reader:
             VERTICES.check(len(self.numbers) / 3, self.path)
 
     def _end_of_value(self, name: str, value: str) -> None:
-        """Keep the text of an element of the object itself, or of a generic attribute."""
+        """Store a text as an attribute of the open object, with ` ft` if its unit is the foot.
+
+        The text is of an element directly in the object, or of a generic attribute.
+        """
         known = self.open[-1][1].attributes
         if not value:
             return

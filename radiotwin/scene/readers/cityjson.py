@@ -24,7 +24,7 @@ _DEPTHS = {"MultiSurface": 0, "CompositeSurface": 0, "Solid": 1, "MultiSolid": 2
 
 
 def cityjson_map(path: Path, documents: Sequence[Any], crs: str | None = None) -> MapFile:
-    """Return the surfaces of buildings in CityJSON; outlines of those without surfaces.
+    """Return the buildings in CityJSON with their surfaces; those without, with their outlines.
 
     Args:
         path: file, for messages.
@@ -49,7 +49,7 @@ def cityjson_map(path: Path, documents: Sequence[Any], crs: str | None = None) -
 
 
 def _transform(path: Path, head: Mapping) -> tuple[np.ndarray, np.ndarray]:
-    """Return scale and translation of the vertices, which are whole numbers."""
+    """Return scale and translation (3,) from the file's whole numbers to its coordinates."""
     known = head.get("transform")
     if known is None:  # optional up to version 1.0
         return np.ones(3), np.zeros(3)
@@ -66,7 +66,7 @@ def _transform(path: Path, head: Mapping) -> tuple[np.ndarray, np.ndarray]:
 
 def _objects(path: Path, document: Any, scale: np.ndarray,
              offset: np.ndarray) -> Iterator[CityObject]:
-    """Yield the objects of a document, with vertices × scale + offset as corners."""
+    """Yield the objects of a CityJSON document; its vertices × scale + offset are corners."""
     try:
         vertices = np.array(document["vertices"], dtype=float).reshape(-1, 3)
         objects = document["CityObjects"]
@@ -101,7 +101,7 @@ def _names(value: Any) -> list[str]:
 
 
 def _attributes(known: Any) -> dict[str, str]:
-    """Return the attributes with a plain value (number, text, boolean) as texts."""
+    """Return name in lower case -> text, of attributes that are a number, text or boolean."""
     if not isinstance(known, dict):
         return {}
     return {str(key).lower(): f"{value:g}" if isinstance(value, float) else str(value)
@@ -109,7 +109,10 @@ def _attributes(known: Any) -> dict[str, str]:
 
 
 def _geometries(geometry: Mapping, corners: np.ndarray) -> Iterator[Geometry]:
-    """Yield a set of surfaces as one geometry, and each solid as one; skip other types."""
+    """Yield a CityJSON geometry's parts: each solid's outer shell, or its surfaces together.
+
+    Other types, such as points, are skipped.
+    """
     kind = geometry["type"]
     if kind not in _DEPTHS:
         return
@@ -124,7 +127,7 @@ def _geometries(geometry: Mapping, corners: np.ndarray) -> Iterator[Geometry]:
 
 
 def _polygon(rings: list, corners: np.ndarray) -> Polygon:
-    """Return the rings of a surface as corners (n, 3)."""
+    """Return the rings (n, 3) of a surface, given as indices of corners; IndexError if negative."""
     indices = [np.array(ring, dtype=np.int64).reshape(-1) for ring in rings]
     if any((ring < 0).any() for ring in indices):
         raise IndexError

@@ -42,9 +42,9 @@ class Block:
 
 
 def make_blocks(prisms: Sequence[Prism], contacts: Contacts) -> list[Block]:
-    """Unite prisms of one material that share a wall; a common corner is not enough.
+    """Unite buildings or parts (prisms) of one material that share a wall, not only a corner.
 
-    Where blocks of different materials overlap or touch, the smaller one is cut.
+    Where blocks of different materials overlap or touch, the smaller one is cut back.
     """
     if not prisms:
         return []
@@ -83,9 +83,9 @@ def make_blocks(prisms: Sequence[Prism], contacts: Contacts) -> list[Block]:
 
 
 def split_roof(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, trimesh.Trimesh | None]:
-    """Split a mesh into walls with bottom, and roofs (faces that look up).
+    """Split a mesh into walls with bottom, and roofs: faces that slope by less than 78 degrees.
 
-    The roofs are None if no face, or every face, looks up.
+    The roofs are None if no face, or every face, is one.
     """
     is_roof = mesh.face_normals[:, 2] > MIN_ROOF_COSINE
     if is_roof.all() or not is_roof.any():
@@ -103,7 +103,7 @@ def _union(solids: list[Manifold]) -> Manifold:
 
 
 def _prism_solid(prism: Prism, wider_m: float = 0.0) -> Manifold:
-    """Return a prism as a solid, with all its faces moved outwards by `wider_m`."""
+    """Return a building or part as a solid, with all its faces moved outwards by `wider_m`."""
     if prism.body is not None:
         solid = _placed_body(prism)
         return _union([solid.translate(wider_m * corner) for corner in _CORNERS]) if wider_m \
@@ -114,9 +114,9 @@ def _prism_solid(prism: Prism, wider_m: float = 0.0) -> Manifold:
 
 
 def _placed_body(prism: Prism) -> Manifold:
-    """Return the solid of a prism's body, moved to the prism's top, with walls to its bottom.
+    """Return the solid of a building from a 3D model, moved so that its top is at the prism's.
 
-    On terrain, the bottom of the prism is lower than that of the body in the file.
+    On terrain the prism's bottom is lower than the moved solid's: vertical walls fill the gap.
     """
     assert prism.body is not None and prism.body.solid is not None
     _, _, low_m, _, _, high_m = prism.body.solid.bounding_box()
@@ -156,10 +156,9 @@ def _extruded(area: shapely.Polygon, bottom_m: float, top_m: float) -> Manifold:
 
 
 def _cleaned_mesh(solid: Manifold) -> trimesh.Trimesh:
-    """Return the mesh of a solid, cleaned unless that would open it.
+    """Return the mesh of a solid, with coincident corners merged unless that would open it.
 
-    Cleaning merges coincident corners. Where a solid touches itself along a vertical edge, both
-    sides need corners of their own.
+    Where a solid touches itself along a vertical edge, both sides need corners of their own.
     """
     found = solid.to_mesh64()
     vertices, faces = found.vert_properties[:, :3], found.tri_verts.astype(np.int64)

@@ -130,7 +130,7 @@ def problems_of(names: Sequence[str], text: str, severity: Severity = "warning")
 
 def left_out_problems(left_out: Sequence[LeftOut],
                       bbox_deg: tuple[float, float, float, float] | None) -> list[Problem]:
-    """Return one problem for each reason why features were left out.
+    """Return a warning for each reason why features of a map were left out.
 
     Only features that reach into the box (south, west, north, east) [degrees] count; None: all do.
     """
@@ -154,7 +154,7 @@ def is_building(tags: Mapping[str, str]) -> bool:
 
 
 def why_excluded(name: str, tags: Mapping[str, str], place: BaseGeometry | None) -> LeftOut | None:
-    """Return why a building is left out (underground, indoors, not standing); None: it is kept."""
+    """Return why tags exclude a building (underground, indoors, not standing); None: it is kept."""
     for key in BUILDING_KEYS:
         if tags.get(key, "").strip().lower() in _LIFECYCLE:
             return LeftOut(f"{name}: {key}={tags[key]}", NOT_THERE, place)
@@ -167,7 +167,7 @@ def why_excluded(name: str, tags: Mapping[str, str], place: BaseGeometry | None)
 
 
 def _below_ground(tags: Mapping[str, str]) -> str:
-    """Return the tag that says that a building lies below the ground; "" if none does."""
+    """Return the tag (`key=value`) that puts a building below the ground; "" if none does."""
     for key, values in _BELOW.items():
         if tags.get(key, "").strip().lower() in values:
             return f"{key}={tags[key]}"
@@ -206,7 +206,7 @@ def _is_set(tags: Mapping[str, str], key: str) -> bool:
 
 
 def check_crowding(bounds: np.ndarray, source: object) -> None:
-    """Raise BadInput if too many bounding boxes (n, 4) overlap.
+    """Raise BadInput if too many bounding boxes (n, 4) overlap for their areas to be processed.
 
     For each box, the boxes that contain its centre are counted. In a city these are few: the
     building itself, and the building that it is a part of.
@@ -228,7 +228,7 @@ class OutlineBudget:
         self.corners = self.crossings = 0
 
     def check(self, name: str, area: BaseGeometry) -> None:
-        """Count an outline (polygons, valid or not) that may cross itself.
+        """Count the corners and crossings of an outline (polygons, valid or not) against limits.
 
         Raises:
             BadInput: it, or all outlines so far, have too many corners or crossings.
@@ -242,7 +242,7 @@ class OutlineBudget:
             self.crossings += self._count_crossings(subject, area)
 
     def _count_crossings(self, subject: str, area: BaseGeometry) -> int:
-        """Return the number of crossings of an area's sides."""
+        """Return how often an area's sides cross; BadInput if with those before it is too often."""
         rings = shapely.get_rings(shapely.get_parts(shapely.get_parts(area)))
         points = [shapely.get_coordinates(ring) for ring in rings]
         ends = [np.stack([ring[:-1], ring[1:]], axis=1) for ring in points]

@@ -146,9 +146,9 @@ def geojson_map(path: Path, data: Any, crs: str | None = None) -> MapFile:
 
 
 def _polygons(path: Path, number: int, geometry: Mapping) -> BaseGeometry | None:
-    """Return the polygons of a GeoJSON geometry; the points of another type; None: neither.
+    """Return the polygons of a GeoJSON geometry; its points if it has none; None: neither.
 
-    If any point has an elevation other than 0, the polygons have a z.
+    If any point has an elevation other than 0, all get z = 1, as a mark that it was there.
     """
     kind = geometry.get("type")
     coordinates: Any = geometry.get("coordinates")  # unchecked: no list raises TypeError below
@@ -197,7 +197,7 @@ def _all_positions(coordinates: Any) -> BaseGeometry | None:
 
 
 def _crs_name(path: Path, data: Mapping) -> str | None:
-    """Return the system's name in an older `crs` member of GeoJSON; None if there is none."""
+    """Return the coordinate reference system that older GeoJSON names in `crs`; None: none."""
     crs = data.get("crs")
     if crs is None:
         return None
@@ -211,7 +211,9 @@ def _crs_name(path: Path, data: Mapping) -> str | None:
 def map_file(
     path: Path, rows: Iterable[tuple[str, Mapping, BaseGeometry | None]], crs: str | None
 ) -> MapFile:
-    """Convert the rows of a table to buildings.
+    """Convert a table's rows to buildings, except those without an area or excluded by their tags.
+
+    If any row has a tag `building` or `building:part`, only such rows are buildings.
 
     Args:
         path: file, for messages.
@@ -256,7 +258,7 @@ def map_file(
 
 
 def _tags(properties: Mapping) -> dict[str, str]:
-    """Convert the columns of a row to tags, without empty cells."""
+    """Convert the columns of a row to tags (key -> text), without empty and nested cells."""
     tags: dict[str, str] = {}
     for key, value in properties.items():
         if (value is None or isinstance(value, dict | list | bytes)
@@ -272,7 +274,7 @@ def _tags(properties: Mapping) -> dict[str, str]:
 
 
 def _part_or_whole(columns: Mapping, tags: dict[str, str]) -> dict[str, str]:
-    """Mark a row of Overture Maps as `building` or `building:part`; leave others unchanged."""
+    """Add the tag `building` or `building:part` to a row of Overture Maps; leave others as is."""
     names = {str(name).lower() for name in columns}
     if not names & set(BUILDING_KEYS) and names & {"facade_color", "roof_shape", "is_underground"}:
         if "building_id" in tags:  # that the part belongs to
@@ -323,9 +325,9 @@ def read_geopackage(path: Path, crs: str | None = None, wanted: Sequence[str] = 
 
 
 def _layers(database: sqlite3.Connection, others: list[str]) -> list[tuple[str, str, int]]:
-    """Return table, geometry column and srs_id of each layer of areas.
+    """Return table, geometry column and srs_id of each layer of areas in a GeoPackage.
 
-    Names of other layers are added to `others`.
+    Names of its other layers of geometries are appended to `others`.
     """
     for table in ("gpkg_contents", "gpkg_geometry_columns", "gpkg_spatial_ref_sys"):
         require_table(database, table)
@@ -347,7 +349,7 @@ def _layers(database: sqlite3.Connection, others: list[str]) -> list[tuple[str, 
 
 def _layer_rows(path: Path, database: sqlite3.Connection, layer: str,
                 geometry: str) -> Iterator[tuple[str, dict[str, Any], Any]]:
-    """Yield name, columns and geometry of each row of a layer."""
+    """Yield a name, the columns and the geometry (None: none) of each row of a GeoPackage layer."""
     # The integer primary key is no attribute
     columns = [name for _, name, kind, _, _, key in stored_columns(database, layer)
                if name.lower() != geometry.lower() and not (key and kind.upper() == "INTEGER")]
@@ -362,7 +364,7 @@ def _layer_rows(path: Path, database: sqlite3.Connection, layer: str,
 
 
 def _package_geometry(blob: Any, source: str) -> BaseGeometry | None:
-    """Return the geometry of a blob [1, section 2.1.3]; None: empty, or not one."""
+    """Return a GeoPackage blob's geometry [1, section 2.1.3]; None: empty, or not a geometry."""
     if not isinstance(blob, bytes) or len(blob) < 8 or blob[:2] != b"GP":
         return None
     flags = blob[3]
@@ -373,7 +375,7 @@ def _package_geometry(blob: Any, source: str) -> BaseGeometry | None:
 
 
 def _srs_name(database: sqlite3.Connection, number: int) -> str | None:
-    """Return the system of a srs_id: authority and code, or WKT; None: undefined."""
+    """Return the coordinate reference system of a srs_id: code or WKT; None: undefined."""
     for known, authority, code, definition in scan(
             database, "gpkg_spatial_ref_sys",
             ["srs_id", "organization", "organization_coordsys_id", "definition"]):
@@ -463,7 +465,7 @@ def _schema(path: Path) -> tuple[list[str], list[str], str, dict | str | None]:
 
 
 def _system_name(path: Path, declared: dict | str) -> str:
-    """Return the name of a system in PROJ's JSON: authority and code, else WKT."""
+    """Return a coordinate reference system in PROJ's JSON by its code, else as WKT."""
     from pyproj import CRS
     from pyproj.exceptions import CRSError
 
@@ -502,7 +504,7 @@ def area_of_wkb(data: bytes, source: object) -> BaseGeometry | None:
 
 
 def _wkb_kinds(data: bytes, source: object) -> set[int]:
-    """Return the kinds (codes of [3]) of a geometry and all geometries nested in it."""
+    """Return the kinds of a geometry and all nested in it: codes of well-known binary [3]."""
     found: set[int] = set()
     at, waiting = 0, [1]  # geometries that are still to be read, by level of nesting
     try:

@@ -104,7 +104,7 @@ READ_COLUMNS = frozenset(name for column in KNOWN for name in (column.name, colu
 
 
 def column_name(text: str) -> str:
-    """Return the tag of a column's name, as in `Feature.tags`.
+    """Return the key, in OpenStreetMap's form, of a column's name; others in lower case.
 
     >>> column_name("Building_Levels"), column_name("HOEHE")
     ('building:levels', 'hoehe')
@@ -113,9 +113,10 @@ def column_name(text: str) -> str:
 
 
 def full_names(cut: Iterable[str], length: int = 10) -> dict[str, str]:
-    """Return cut name -> full name of known columns, as Shapefiles cut names.
+    """Return short name -> full name, for known columns that a Shapefile cut at `length`.
 
-    Columns of elevations are left out: `b3_h_dak_m` could be the highest or the lowest roof.
+    Names that several known columns begin with are left out: `b3_h_dak_m` could be the highest or
+    the lowest roof.
 
     >>> full_names(["b3_h_maaiv", "b3_h_dak_m", "height"])
     {'b3_h_maaiv': 'b3_h_maaiveld'}
@@ -150,7 +151,10 @@ def check_declared(column: HeightColumn, rows: Iterable[Mapping[str, str]], sour
 
 
 def no_height_text(rows: list[Mapping[str, str]]) -> str | None:
-    """Return the message that no row has a usable height; None if no column has numbers."""
+    """Return the message that no row has a usable height, and how to name a column of heights.
+
+    None if no column holds numbers, so that none could be named.
+    """
     counts: dict[str, int] = {}
     for tags in rows:
         for key, value in tags.items():
@@ -224,10 +228,11 @@ class Height:
 
 def height_of(tags: Mapping[str, str], default_m: float,
               declared: HeightColumn | None = None) -> Height:
-    """Return the vertical extent of a building.
+    """Return bottom and top of a building above the ground, with their source.
 
-    The top is the first usable of the declared column, the columns `KNOWN`, and the default. The
-    bottom is `min_height`, else `building:min_level` × 3 m, but at least 0 (the ground).
+    The top is the first usable of the declared column, the columns `KNOWN`, and the default;
+    usable is above 0, up to `MAX_HEIGHT_M`. The bottom is `min_height`, else
+    `building:min_level` × 3 m, but at least 0 (the ground).
 
     Args:
         tags: tags of the building.
@@ -255,9 +260,10 @@ def height_of(tags: Mapping[str, str], default_m: float,
 
 def _first_length_m(tags: Mapping[str, str], keys: Iterable[tuple[str, float]], unusable: list[str],
                     lowest_m: float = 0.0) -> float:
-    """Return the first usable length [m] of tags, given with their units [m]; 0 if there is none.
+    """Return the first tag's value that is a possible length [m]; 0 if there is none.
 
-    Others are appended to `unusable`.
+    `keys` are tags with their units [m], possible values from `lowest_m` to `MAX_HEIGHT_M`. Tags
+    with other values are appended to `unusable`.
     """
     for key, unit_m in keys:
         if key in tags:
@@ -269,9 +275,10 @@ def _first_length_m(tags: Mapping[str, str], keys: Iterable[tuple[str, float]], 
 
 
 def height_sds_m(top_m: np.ndarray, sd_m: np.ndarray) -> np.ndarray:
-    """Estimate the standard deviations of default heights, and return all (n,) [m].
+    """Return the standard deviations of heights (n,) [m], estimated where the height is a default.
 
-    It is the RMS difference of the map's known heights from the default, at least that of storeys.
+    It is the RMS difference of the map's known heights (`GUESS_SD_M` if there are less than
+    `MIN_KNOWN`) from the default, at least that of heights counted in storeys.
 
     Args:
         top_m: (n,) heights of the tops above the ground [m].
@@ -300,7 +307,7 @@ def source_text(source: str, declared: HeightColumn | None = None) -> str:
 
 
 def _top_m(column: HeightColumn, tags: Mapping[str, str]) -> float:
-    """Return the height of the top above the ground from a column [m]; NaN if it is no number."""
+    """Return a building's height from a column, minus its ground column [m]; NaN: no number."""
     unit_m = UNITS_M[column.unit]
     top = parse_length_m(tags[column.name]) if column.unit == "m" else number(tags[column.name])
     top += column.name == HIGHEST

@@ -64,7 +64,11 @@ def choose_layers(path: Path, columns: Mapping[str, Sequence[str]],
 
 
 def _building_layers(columns: Mapping[str, Sequence[str]]) -> list[str]:
-    """Return the layers that hold buildings by the first rule that matches any."""
+    """Return the layers that hold buildings, by their names and columns.
+
+    Of 3D BAG's they are the outlines and the most detailed LoD in 2D. Else, those with tags of
+    buildings; if there are none, with names like `building`; then, with known heights.
+    """
     names = list(columns)
     if len(names) < 2:
         return names
@@ -116,7 +120,7 @@ def join_layers(path: Path, parts: Mapping[str, MapFile], problems: list[Problem
 
 
 def _share_within(areas: Sequence[shapely.Geometry], others: Sequence[shapely.Geometry]) -> float:
-    """Return the share of areas with an inner point in one of the others."""
+    """Return the share (0 to 1) of areas that have an inner point within one of the others."""
     if not areas or not others:
         return 0.0
     inside = shapely.STRtree(others).query(shapely.point_on_surface(list(areas)), "within")[0]

@@ -101,7 +101,7 @@ class OsmElements:
     remarked: bool = False
 
     def node_at(self, place: tuple[float, float], number: int | None = None) -> int:
-        """Add a node at a position; without a number, return the node there, or make one up."""
+        """Store a node's position; return its id: if None, that of a known node there, or new."""
         known = self.nodes_at.setdefault(
             place, _MADE_UP - len(self.nodes_at) if number is None else number)
         known = known if number is None else number
@@ -176,7 +176,7 @@ def _streets(elements: OsmElements) -> list[np.ndarray]:
 
 
 def _place(element: Way | Relation, elements: OsmElements) -> BaseGeometry:
-    """Return the first known points of a way, or of a relation's ways, to locate it."""
+    """Return the known points of a way's or relation's first nodes, to tell where it lies."""
     ways = [element] if isinstance(element, Way) else [
         elements.ways[number] for number, _ in element.members if number in elements.ways]
     nodes = islice((node for way in ways for node in way.nodes), _PLACE_NODES)
@@ -185,7 +185,7 @@ def _place(element: Way | Relation, elements: OsmElements) -> BaseGeometry:
 
 
 def _vegetation(elements: OsmElements) -> tuple[list[Feature], list[LeftOut]]:
-    """Return areas of vegetation and rows of trees, and the unusable ones."""
+    """Return woods, parks and rows of trees, and those with a broken or too intricate outline."""
     found: list[Feature] = []
     unusable: list[LeftOut] = []
     budget = OutlineBudget("the map")
@@ -212,7 +212,7 @@ def _vegetation(elements: OsmElements) -> tuple[list[Feature], list[LeftOut]]:
 
 def _way_area(name: str, way: Way, kind: str,
               elements: OsmElements) -> BaseGeometry | Literal["incomplete"]:
-    """Return the polygon of a way of vegetation; of a row of trees, the line."""
+    """Return a way of vegetation as a polygon, a row of trees as a line; else `incomplete`."""
     OUTLINE_CORNERS.check(len(way.nodes), name)
     if not elements.has_positions(way.nodes) or not (
             _is_ring(way.nodes) or (kind == "tree_row" and len(way.nodes) > 1)):
@@ -223,9 +223,9 @@ def _way_area(name: str, way: Way, kind: str,
 
 
 def _relation_tags(relation: Relation, elements: OsmElements) -> dict[str, str] | None:
-    """Return the tags of a relation that is a building, else None.
+    """Return the tags of a multipolygon relation that is a building; None if it is not.
 
-    In old maps the tags are those of the outer ways.
+    A single outer way adds its tags; in old maps, all outer ways have them instead.
     """
     if relation.tags.get("type") != "multipolygon":
         return None
@@ -246,7 +246,7 @@ def _relation_tags(relation: Relation, elements: OsmElements) -> dict[str, str] 
 def _relation_area(
     name: str, relation: Relation, elements: OsmElements, budget: OutlineBudget
 ) -> BaseGeometry | Literal["incomplete", "open"]:
-    """Return the area of a multipolygon; `incomplete`: ways or nodes lack; `open`: no rings."""
+    """Return a multipolygon's area; `incomplete`: ways or nodes lack; `open`: no ring closes."""
     chains: dict[bool, list[Sequence[int]]] = {True: [], False: []}
     corners, named = 0, True
     for number, role in relation.members:
@@ -269,7 +269,7 @@ def _relation_area(
 
 
 def _is_courtyard(way: Way, area: BaseGeometry, elements: OsmElements) -> bool:
-    """Return whether a way is the border of a hole: a point just inside it is not in the area."""
+    """Return whether a way bounds a hole of an area: a point just inside the way is not in it."""
     if not _is_ring(way.nodes):
         return False
     outline = shapely.make_valid(_polygon(way.nodes, elements))
@@ -288,13 +288,14 @@ def _is_ring(nodes: Sequence[int]) -> bool:
 
 
 def stitch(chains: list[Sequence[int]]) -> list[list[int]] | None:
-    """Join ways that meet at their ends to closed rings.
+    """Join ways at their common end nodes into closed rings.
 
     Args:
         chains: ids of the nodes of each way.
 
     Returns:
-        ids of the nodes of each ring, the first again at the end; None if a ring cannot be closed.
+        ids of the nodes of each ring, the first again at the end; rings of fewer than three corners
+        are dropped. None if a way cannot be closed to a ring.
     """
     rings = [list(chain) for chain in chains if _is_ring(chain)]
     loose = {number: list(chain) for number, chain in enumerate(chains)
@@ -347,7 +348,10 @@ class _XmlReader:
         self.subject = ""  # its file and line
 
     def start(self, tag: str, attributes: dict[str, str], line: int) -> None:
-        """Begin an element: a node, way or relation, or a tag, node or member of one."""
+        """Begin an XML element: open a node, way or relation, or add to the open one.
+
+        Elements that an editor marked as deleted are skipped.
+        """
         self.depth += 1
         if self.depth == 1 and tag != "osm":
             raise BadInput(f"{self.path}, line {line}: the file begins with <{tag}>, not <osm>; "
@@ -372,7 +376,7 @@ class _XmlReader:
                 "ref": self._integer(attributes, "ref", line) if is_way else None})
 
     def _element(self, tag: str, attributes: dict[str, str], line: int) -> None:
-        """Store a node, or open a way or relation."""
+        """Store a node, open a way or relation, or note that Overpass added a remark."""
         if tag == "node":
             number = self._integer(attributes, "id", line)
             self.elements.positions[number] = _position(f"{self.path}, line {line}: a node",
@@ -387,7 +391,7 @@ class _XmlReader:
             self.elements.remarked = True
 
     def end(self, tag: str) -> None:
-        """End an element: store a way or relation."""
+        """End an XML element; the open way or relation is stored at its end."""
         self.depth -= 1
         if self.depth == 1 and self.open is not None:
             _add_element(self.elements, self.subject, self.open)
@@ -442,7 +446,7 @@ def _add_element(elements: OsmElements, subject: str, element: Mapping) -> None:
 
 
 def _nodes(elements: OsmElements, subject: str, element: Mapping) -> list[int]:
-    """Return the nodes of a way or member, and add the positions that `out geom;` gave them."""
+    """Return a way's node ids; positions in it (by Overpass's `out geom;`) go to `elements`."""
     nodes = [_whole(subject, node) for node in _list(subject, element, "nodes")]
     for row, point in enumerate(_list(subject, element, "geometry")):
         if isinstance(point, dict):  # null: outside of Overpass's box
@@ -534,7 +538,7 @@ def read_osm_pbf(path: Path) -> OsmElements:
 
 
 def _add_ways(elements: OsmElements, ways: Iterable[Any]) -> None:
-    """Add pyosmium's ways; BadInput if there are too many."""
+    """Add the ways that pyosmium reads to `elements`; BadInput if there are too many."""
     corners = sum(len(way.nodes) for way in elements.ways.values())
     for way in ways:
         nodes = [node.ref for node in way.nodes]
@@ -545,7 +549,7 @@ def _add_ways(elements: OsmElements, ways: Iterable[Any]) -> None:
 
 
 def _street_ways(ways: Iterable[Any], known: Mapping[int, Way]) -> dict[int, Way]:
-    """Return pyosmium's streets that are not in `known`; none if they have too many nodes."""
+    """Return id -> street of pyosmium's ways that are not in `known`; {} with too many nodes."""
     found: dict[int, Way] = {}
     nodes = 0
     for way in ways:
@@ -559,7 +563,10 @@ def _street_ways(ways: Iterable[Any], known: Mapping[int, Way]) -> dict[int, Way
 
 
 def _drop_other_relations(elements: OsmElements) -> None:
-    """Drop relations that neither their own tags nor their ways make vegetation or buildings."""
+    """Delete relations that neither a tag nor an outer way makes a building or vegetation.
+
+    At that time `elements.ways` holds only ways of buildings and vegetation.
+    """
     for number, relation in list(elements.relations.items()):
         if kind_of(relation.tags) is None and not any(
                 key in relation.tags for key in BUILDING_KEYS) and not any(

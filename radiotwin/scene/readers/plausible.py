@@ -41,7 +41,10 @@ _NEIGHBOURS = (((_FIRST, _ALL), (_LAST, _ALL)), ((_LAST, _ALL), (_FIRST, _ALL)),
 
 def implausible_heights(buildings: Sequence[tuple[str, Height, BaseGeometry]],
                         columns: Mapping[str, Mapping[str, str]]) -> list[Problem]:
-    """Return a warning about buildings whose height is implausible.
+    """Return a warning about buildings whose height is implausible, and what the column may hold.
+
+    Implausible is above `RARE_M` or `RARE_SLENDERNESS` times the width; of all buildings, a median
+    above `MAX_MEDIAN_M` or below the height of a room.
 
     Args:
         buildings: name, height and footprint in the local frame [m]; default heights are skipped.
@@ -90,7 +93,7 @@ def _width_m(site: BaseGeometry) -> float:
 
 def _remedy(source: str, known: Sequence[tuple[str, Height, BaseGeometry]],
             columns: Mapping[str, Mapping[str, str]]) -> str:
-    """Return a remedy for a column of implausible heights: what it may hold, and the option."""
+    """Return advice on a column of implausible heights: what it may hold, which option to give."""
     if source == "model":
         return "; are the model's elevations in metres?"
     column = source.split(" - ")[0]
@@ -105,7 +108,10 @@ def _remedy(source: str, known: Sequence[tuple[str, Height, BaseGeometry]],
 
 def _ground_column(known: Sequence[tuple[str, Height, BaseGeometry]],
                    columns: Mapping[str, Mapping[str, str]]) -> str | None:
-    """Return a column that may be the ground's elevation: minus it, heights are usual; or None."""
+    """Return the column that may hold the ground's elevation; None if there is none.
+
+    It is one that, subtracted from implausible heights, leaves usual ones for every building.
+    """
     rows = [(height.top_m, columns.get(name, {})) for name, height, _ in known]
     for column in sorted({column for _, tags in rows for column in tags}):
         above_m = np.array([top_m - number(tags.get(column, "")) for top_m, tags in rows])
@@ -146,7 +152,9 @@ def zero_voids(height_m: np.ndarray, pixel_m: float) -> np.ndarray:
 
 
 def steep_steps(height_m: np.ndarray, pixel_m: float) -> tuple[float, int]:
-    """Return the largest step between neighbouring pixels [m], and the number of implausible ones.
+    """Return the largest step between neighbouring pixels [m], and how many are implausible.
+
+    Implausible are more than `STEP_M` with a slope steeper than 80 degrees.
 
     Args:
         height_m: (rows, columns) [m], NaN without data.

@@ -59,7 +59,7 @@ _ERRORS = (struct.error, ValueError, LookupError, TypeError, AttributeError, Ass
 
 def _multipatch_buildings(path: Path, rows: Iterable[tuple[str, Mapping, Any]],
                           system: str) -> MapFile:
-    """Return the buildings of multipatches, rows (name, columns, surfaces)."""
+    """Convert multipatches (3D surfaces), rows (name, columns, surfaces), to buildings."""
     known = find_system(path, system)
     project, unit_m = degrees_from(path, plane_of(known)), vertical_unit_m(known)
     objects = []
@@ -78,7 +78,7 @@ def _multipatch_buildings(path: Path, rows: Iterable[tuple[str, Mapping, Any]],
 
 
 def _multipatch_polygons(shape: Any) -> list[Polygon]:
-    """Return the polygons of a multipatch: triangles of strips and fans, rings with their holes."""
+    """Return a multipatch's polygons: strips and fans as triangles, rings with their holes."""
     found: list[Polygon] = []
     outline = None  # kind of the last ring that may have holes
     for part, kind in zip(_parts(shape, getattr(shape, "z", ())), getattr(shape, "partTypes", ())):
@@ -97,7 +97,7 @@ def _multipatch_polygons(shape: Any) -> list[Polygon]:
 
 
 def _parts(shape: Any, *others: Any) -> list[np.ndarray]:
-    """Return the corners x, y (and others, such as z) of each part of a shape.
+    """Return the corners (n, 2) of each part of a shape, with columns for `others`, such as z.
 
     Raises:
         ValueError: a coordinate is not finite, or a part begins outside the shape.
@@ -234,7 +234,7 @@ def _pyshp(path: Path) -> Any:
 
 def _rows(path: Path, name: str, files: Mapping[str, bytes], convert: Callable[[Any], Any]
           ) -> Iterator[tuple[str, dict[str, Any], Any]]:
-    """Yield name, columns and converted shape of each building."""
+    """Yield name, columns and shape (by `convert`) of each row that is not deleted or empty."""
     shapefile = _pyshp(path)
     subject = f"{path}, {name}"
     records = _check_records(subject, files[".shp"])
@@ -258,7 +258,7 @@ def _rows(path: Path, name: str, files: Mapping[str, bytes], convert: Callable[[
 
 
 def _check_records(subject: str, data: bytes) -> int:
-    """Return the number of shapes of a `.shp` file, whose record headers are checked one by one."""
+    """Return the number of shapes in a `.shp` file; BadInput if it is damaged or of other types."""
     if len(data) < _HEADER or struct.unpack(">i", data[:4])[0] != _MAGIC:
         raise BadInput(f"{subject} is not a readable Shapefile (its .shp begins otherwise); export "
                        "it again")
@@ -281,9 +281,10 @@ def _check_records(subject: str, data: bytes) -> int:
 
 
 def _polygons(shape: Any) -> BaseGeometry | None:
-    """Return the polygons of a shape: rings oriented as its largest are outlines, others holes.
+    """Return the polygons of a shape: rings that turn as its largest are outlines, others holes.
 
-    Outlines run clockwise [1]; some writers reverse all rings.
+    Outlines run clockwise [1], but some writers reverse all rings. A hole goes to the smallest
+    outline around it.
     """
     parts = _parts(shape)
     if sum(map(len, parts)) > OUTLINE_CORNERS.limit:  # refused later, if it is in the box
@@ -307,7 +308,7 @@ def _polygons(shape: Any) -> BaseGeometry | None:
 
 
 def _with_courtyards(area: shapely.MultiPolygon) -> BaseGeometry:
-    """Make the polygons within the largest one holes: some writers orient all rings alike."""
+    """Turn polygons inside the largest one into holes: some writers orient all rings alike."""
     parts = sorted(area.geoms, key=lambda part: -part.area)
     if area.is_valid or parts[0].bounds != area.bounds:
         return area

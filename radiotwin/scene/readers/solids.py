@@ -85,7 +85,7 @@ def make_prisms(
     features: Sequence[Feature], origin: Origin, table: MaterialTable, default_height_m: float,
     height_column: HeightColumn | None = None
 ) -> tuple[list[Prism], list[Problem]]:
-    """Make prisms from buildings and their parts, parts first; also return the problems.
+    """Make prisms (outline, bottom, top, material) from buildings and parts, parts first.
 
     Args:
         features: buildings and parts.
@@ -93,6 +93,9 @@ def make_prisms(
         table: materials by tag.
         default_height_m: height of a building without a usable one [m].
         height_column: column of heights that the user named; None: known ones.
+
+    Returns:
+        The prisms, and problems of the features.
     """
     defects = _Defects()
     areas = _clean_areas(features, origin, defects)
@@ -171,7 +174,7 @@ class _Defects:
 
 
 def _clean_areas(features: Sequence[Feature], origin: Origin, defects: _Defects) -> list[Area]:
-    """Return the features with their cleaned areas in the local frame, without empty areas."""
+    """Return features with repaired areas in the local frame [m]; empty ones go to `defects`."""
     areas = shapely.transform([feature.area for feature in features],
                               lambda points: np.column_stack(to_local(origin, *points.T)))
     return [(feature, kept) for feature, area in zip(features, areas)
@@ -180,7 +183,7 @@ def _clean_areas(features: Sequence[Feature], origin: Origin, defects: _Defects)
 
 def _clean_area(feature: Feature, area: BaseGeometry,
                 defects: _Defects) -> shapely.MultiPolygon | None:
-    """Return the polygons of an area [m], repaired and rounded, without slivers, or None."""
+    """Return a feature's polygons [m], repaired, rounded, without slivers; None if none is left."""
     invalid = not area.is_valid
     area, shared_m2 = _unite_polygons(area)
     if area.area < GRID_M**2:
@@ -236,7 +239,8 @@ def _resolve_parts(
 
     Returns:
         Parts, then buildings: feature, area, and the building with its full area. The building of a
-        part is the smallest one around it; the part itself if there is none.
+        part is the smallest one around it; the part itself if there is none. Buildings that their
+        parts cover to `MIN_COVERED_SHARE` are left out.
     """
     tree, found = shapely.STRtree([area for _, area in buildings]), 0
     building_m2 = [area.area for _, area in buildings]
@@ -269,7 +273,10 @@ def _resolve_parts(
 
 
 def _inherit_tags(part: Feature, building: Feature) -> Feature:
-    """Add the tags of a building to a part of it, except its bottom, and heights the part has."""
+    """Return a building part with the tags of its building added where it has none.
+
+    Not inherited are the bottom, and tags that would change the part's own height.
+    """
     tags = {key: value for key, value in building.tags.items()
             if key not in ("min_height", "building:min_level")}
     known = [column.name for column in KNOWN]
@@ -296,7 +303,7 @@ class Contacts:
 
 
 def find_contacts(prisms: Sequence[Prism]) -> Contacts:
-    """Find prisms that touch or overlap; BadInput if there are too many such pairs."""
+    """Find pairs of buildings or parts (prisms) that touch or overlap; BadInput if too many."""
     areas: Any = np.array([prism.area for prism in prisms], dtype=object)
     pairs = _touching_pairs(prisms, areas)
     shared_m2, shared_m = np.zeros(len(pairs)), np.zeros(len(pairs))
@@ -311,7 +318,7 @@ def find_contacts(prisms: Sequence[Prism]) -> Contacts:
 
 
 def _touching_pairs(prisms: Sequence[Prism], areas: Any) -> np.ndarray:
-    """Return the (n, 2) pairs of prisms that touch, the lower index first."""
+    """Return the (n, 2) pairs of prisms that touch in plan and height, the lower index first."""
     bottom_m = np.array([prism.height.bottom_m for prism in prisms])
     top_m = np.array([prism.height.top_m for prism in prisms])
     corners, found = shapely.get_num_coordinates(areas), 0
@@ -329,7 +336,7 @@ def _touching_pairs(prisms: Sequence[Prism], areas: Any) -> np.ndarray:
 
 def find_overlaps(prisms: Sequence[Prism],
                   contacts: Contacts) -> list[tuple[Prism, Prism, float]]:
-    """Return pairs of prisms of different buildings, and the area they share, above 1 m² [m²]."""
+    """Return pairs of prisms of different buildings that overlap by over 1 m², and by how much."""
     found = []
     for (a, b), shared_m2 in zip(contacts.pairs.tolist(), contacts.shared_m2.tolist()):
         first, second = prisms[a], prisms[b]
@@ -342,7 +349,9 @@ def find_overlaps(prisms: Sequence[Prism],
 
 def make_shell_prisms(features: Sequence[Feature], origin: Origin, table: MaterialTable
                       ) -> tuple[list[Prism], list[Problem]]:
-    """Make a prism with a body from each feature with a shell; also return the problems.
+    """Make a prism from each building with 3D surfaces (a shell); also return the problems.
+
+    The prism has the shell's footprint, bottom and top, and its surfaces as body.
 
     Args:
         features: features with shells.
@@ -379,7 +388,7 @@ def make_shell_prisms(features: Sequence[Feature], origin: Origin, table: Materi
 
 
 def _with_sites(prisms: Sequence[Prism]) -> list[Prism]:
-    """Set `site` of prisms to the united areas of all prisms of the same name."""
+    """Return the prisms with the footprint of their whole building: the union by name."""
     areas: dict[str, list[BaseGeometry]] = {}
     for prism in prisms:
         areas.setdefault(prism.name, []).append(prism.area)
@@ -442,7 +451,7 @@ def _footprint(vertices: np.ndarray, faces: np.ndarray, name: str) -> shapely.Mu
 
 
 def _body(vertices: np.ndarray, faces: np.ndarray) -> tuple[Body, bool]:
-    """Return surfaces as a solid if they are closed, else as a mesh; also whether they are."""
+    """Return a building's triangles as a solid if closed, else as a mesh; and whether closed."""
     used, faces = np.unique(faces, return_inverse=True)
     vertices, faces = vertices[used], faces.reshape(-1, 3)
     solid = closed_solid(vertices, faces)

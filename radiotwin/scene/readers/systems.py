@@ -23,7 +23,7 @@ _MARGIN_DEG = 1.0  # around the area of use that a system declares
 
 
 def find_system(path: Path, name: str) -> "CRS":
-    """Look up a system that a file names; see `radiotwin.geo.reference_system`.
+    """Look up a coordinate reference system by its name in a file; see `reference_system`.
 
     Raises:
         BadInput: the name is unknown, or of a form that could open a file.
@@ -64,10 +64,10 @@ def degrees_from(path: Path, system: "CRS") -> Callable[[np.ndarray], np.ndarray
 
 
 def chosen_system(path: Path, named: str | None, declared: str | None) -> str | None:
-    """Return the name of a file's system: the one in the file, else the one the user declared.
+    """Return the name of a file's coordinate reference system: the file's own, else the user's.
 
     Raises:
-        BadInput: both are given and differ.
+        BadInput: both are given, and their horizontal parts differ.
     """
     if named is None or declared is None:
         return declared if named is None else named
@@ -88,7 +88,7 @@ def check_declared_system(name: str) -> None:
 
 
 def find_city_system(path: Path, name: str) -> "CRS":
-    """Look up a system by a name as in GML and CityJSON.
+    """Look up a coordinate reference system by a name as in GML and CityJSON.
 
     Such names are `urn:ogc:def:crs:EPSG::25832`, `https://www.opengis.net/def/crs/EPSG/0/7415`,
     `urn:ogc:def:crs,crs:EPSG::25832,crs:EPSG::7837`, `urn:adv:crs:ETRS89_UTM32`.
@@ -107,7 +107,7 @@ def find_city_system(path: Path, name: str) -> "CRS":
 
 
 def vertical_unit_m(system: "CRS") -> float:
-    """Return the unit of a system's elevations [m]; if it has none, the unit of its plane."""
+    """Return how many metres the unit of a system's elevations has; without one, of its plane."""
     axes = system.axis_info
     if len(axes) > 2:
         return float(axes[2].unit_conversion_factor)

@@ -153,7 +153,10 @@ def _upward(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 def _errors(mesh: Delaunay, node: np.ndarray, z_m: np.ndarray,
             chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the triangle (n,) that each node lies in, and its vertical distance from it [m]."""
+    """Return the triangle that each node (n,) lies in, and its vertical distance from that [m].
+
+    Nodes `chosen` (indices) are the corners of the triangles: their distance is 0.
+    """
     triangle = mesh.find_simplex(node)
     affine = mesh.transform[triangle]
     share = np.einsum("nij,nj->ni", affine[:, :2], node - affine[:, 2])
@@ -165,7 +168,7 @@ def _errors(mesh: Delaunay, node: np.ndarray, z_m: np.ndarray,
 
 
 def _worst_nodes(triangle: np.ndarray, error_m: np.ndarray, tolerance_m: float) -> np.ndarray:
-    """Return the farthest node of each triangle, if beyond the tolerance, the worst first."""
+    """Return the index of the farthest node of each triangle, beyond the tolerance, worst first."""
     order = np.argsort(-error_m, kind="stable")
     order = order[error_m[order] > tolerance_m]
     _, first = np.unique(triangle[order], return_index=True)
@@ -231,7 +234,7 @@ def read_heights(path: Path, origin: Origin, box_m: Bounds, unit: str | None = N
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """Open a GeoTIFF of one band whose blocks are small enough."""
+    """Open a GeoTIFF for reading in a context; BadInput if `_check` refuses it."""
     check_input(path, "terrain raster (GeoTIFF)")
     rasterio = optional_package(
         "rasterio", f"{path}: terrain is read with the package rasterio, which is not installed; "
@@ -253,7 +256,7 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 def _check(path: Path, file: Any) -> None:
-    """Raise BadInput for several bands, pixels that are no numbers, large blocks, or overviews."""
+    """Raise BadInput if a GeoTIFF has several bands, no numbers, large blocks, or overviews."""
     if file.count != 1:
         raise BadInput(f"{path} has {file.count} bands, as a picture has; give a GeoTIFF with one "
                        "band of heights (`gdal_translate -b 1` takes out the first)")
@@ -332,7 +335,7 @@ def _vertical(path: Path, file: Any, system: "CRS",
 
 def _nodes(file: Any, system: "CRS", origin: Origin,
            box_m: Bounds) -> tuple[np.ndarray, np.ndarray, int, float]:
-    """Choose the nodes of the grid.
+    """Choose the nodes of the grid over a box: as dense as pixels, at most `MAX_NODES`.
 
     Returns:
         x (nx,) and y (ny,) of the nodes [m], the number of pixels per node along each axis, and the
@@ -408,7 +411,7 @@ def _window(path: Path, file: Any, column: np.ndarray, row: np.ndarray, every: i
 
 
 def _means(values: np.ndarray, every: int) -> np.ndarray:
-    """Return the means over squares of `every` x `every` pixels, of finite values only."""
+    """Return the mean of the finite values in each square of `every` x `every` pixels, or NaN."""
     squares = values.reshape(values.shape[0] // every, every, values.shape[1] // every, every)
     known = np.isfinite(squares)
     count = known.sum(axis=(1, 3))
@@ -417,7 +420,7 @@ def _means(values: np.ndarray, every: int) -> np.ndarray:
 
 
 def _uncovered(path: Path, origin: Origin, box_m: Bounds, share: float) -> BadInput:
-    """Return the error that a raster covers only a share of the area."""
+    """Return the error that a raster covers only a share (0 to 1) of the box [m]."""
     x_min, x_max, y_min, y_max = box_m
     west, south = (float(value) for value in to_geographic(origin, x_min, y_min))
     east, north = (float(value) for value in to_geographic(origin, x_max, y_max))
@@ -501,7 +504,7 @@ def _fact(grid: HeightGrid, mesh: GroundMesh, datum_m: float) -> str:
 
 
 def raise_to_terrain(prisms: Sequence[Prism], ground: Ground) -> list[Prism]:
-    """Move buildings up to a terrain; on flat ground they stay.
+    """Return the buildings moved up to a terrain; on flat ground, unchanged.
 
     Heights of OpenStreetMap, and of most 3D city models, count from the lowest point where the
     building meets the ground [1], those of its parts, too. Walls that begin at the ground are

@@ -68,7 +68,7 @@ def make_vegetation(features: Sequence[Feature], origin: Origin,
 
 
 def _largest(found: list[VegetationConfig]) -> tuple[list[VegetationConfig], list[Problem]]:
-    """Return the largest areas, as many as a scene may declare, and a warning about the others."""
+    """Return the largest areas, with as many corners as a scene may have; warn of the others."""
     size_m2 = [_area_m2(area) for area in found]
     order = sorted(range(len(found)), key=lambda row: -size_m2[row])
     corners = np.cumsum([sum(map(len, found[row].rings_m)) for row in order])
@@ -86,7 +86,7 @@ def _area_m2(declared: VegetationConfig) -> float:
 
 
 def vegetation_fact(declared: Sequence[VegetationConfig]) -> str:
-    """Format number and size of the vegetation's areas, for the report."""
+    """Format the number of areas of vegetation, and their size [ha] by kind, for the report."""
     area_m2 = dict.fromkeys(HEIGHT_M, 0.0)
     for area in declared:
         area_m2[area.kind] += _area_m2(area)
