@@ -21,7 +21,7 @@ from marl.settings import stream
 from marl.worlds import WorldSource
 
 QUANTILES = (0.1, 0.5, 0.9)
-CAUTION = (0.0, 0.7, 1.4, 2.1)  # levels are lowered by this many standard deviations of errors
+CAUTION = (0.0, 0.7, 1.4, 2.1)  # SNRs are lowered by this many standard deviations of errors
 TRIED_PLANS, CHOOSING_WORLDS = len(CAUTION), 20  # number of plans; worlds that choose the best
 SCHEMA = "radiotwin.plan/1"
 

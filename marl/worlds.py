@@ -104,7 +104,7 @@ def draw_positions(twin: Twin, row: int, scene: Scene, count: int,
         pending[pending] = inside | outside
         if not pending.any():
             break
-    if pending.any() and not pending.all():  # hardly any free room: repeat those that were found
+    if pending.any() and not pending.all():  # hardly any free space: repeat positions found
         drawn_m[pending] = drawn_m[rng.choice(np.flatnonzero(~pending), int(pending.sum()))]
     return drawn_m
 

@@ -84,7 +84,7 @@ def grow_trees(kind: str, features: np.ndarray, target: np.ndarray, seed: int,
     boosting = HistGradientBoostingRegressor(
         learning_rate=LEARNING_RATE * TREES / trees, max_iter=2 * trees, early_stopping=False,
         random_state=seed)
-    # OpenMP's threads wait busily: beside the folds' own threads they take up to a hundred times as
+    # OpenMP's threads wait busily: together with the folds' threads they take up to 100 times as
     # long as a single one.
     with _openmp().limit(limits=1):
         return Forest.of_boosting(boosting.fit(features, target))

@@ -18,7 +18,7 @@ from radiotwin.inference.held_out import combine, convex_weights
 from radiotwin.inference.student import Losses, ReadingLaw
 from radiotwin.twin.model.blend import NAMED, blended, far_share, sd_factor
 
-HALF_M = 50.0  # half distance if no links tell it [m]
+HALF_M = 50.0  # half distance if it cannot be estimated from links [m]
 PULL = 0.01  # shrinkage towards the best member, see `convex_weights`: 2 % of the RMSE
 QUADRANT_COUNTS = (1.0, 0.25, 0.0625, 0.0)  # weights of the quadrants that are tried in turn
 AS_GOOD = 1.01  # largest ratio of the RMSE on an unseen fold to that of the best member

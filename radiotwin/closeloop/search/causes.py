@@ -1,7 +1,7 @@
 """Search for lasting causes by forward selection: add the best effect, step by step.
 
 Candidates are fitted to all links and without each fold, scored on held-out links and by their
-evidence beside a correlated residual, and kept one by one while they are probable.
+evidence given correlated residuals, and kept one by one while they are probable.
 
 Some effects are probable only together, such as three masts with sector antennas, or a displaced
 anchor and a receiver that drifts: for each, the others look like noise. So if the likeliest effect

@@ -65,7 +65,7 @@ class Candidate:
         effect: the effect without parameters.
         whole: fit to all links with the effect.
         gain_nats: gain of the training objective; links count as independent.
-        evidence_nats: evidence beside a correlated residual, see `Hypotheses`; NaN if not computed.
+        evidence_nats: evidence given correlated residuals, see `Hypotheses`; NaN if not computed.
     """
 
     effect: Effect

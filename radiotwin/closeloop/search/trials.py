@@ -26,7 +26,7 @@ class Trial:
         step: number of effects in the model before.
         gain_by_fold: (folds,) `nll_gain` of each fold, divided by the design effect;
             empty if it was not scored.
-        evidence_nats: evidence beside a correlated residual, see `Hypotheses`; NaN if not computed.
+        evidence_nats: evidence given correlated residuals, see `Hypotheses`; NaN if not computed.
         passed: whether held-out links support it; it may be refused for other reasons.
         features: (5,) features of its probability, see `radiotwin.closeloop.verdict.posterior`;
             empty if it was not scored.

@@ -8,7 +8,7 @@ from radiotwin.errors import BadInput
 
 # Search (`radiotwin.closeloop.search`).
 MIN_FIRST_SHARE = 0.5  # a candidate this share of `min_probability` probable is tried with a second
-MAX_SECONDS = 2  # effects tried beside it
+MAX_SECONDS = 2  # second effects that are tried with such a candidate
 MIN_RIVAL_SHARE = 0.5  # share of the best candidate's gain from which repeats of another are tried
 SAME_DB = 1.5  # offset of a receiver's limit and of its readings this close are one fault [dB]
 MIN_SHARED = 0.5  # share of links in common from which two faults or groups are the same

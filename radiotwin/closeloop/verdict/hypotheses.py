@@ -53,7 +53,7 @@ class Hypotheses:
         evidence: marginal likelihood of its residuals with a correlated field.
         links: the training links.
         scale_db: (n,) error scale, by which all residuals are divided.
-        nuisance: design columns fitted beside any cause [scales].
+        nuisance: design columns of usual errors of a base, fitted with every cause [scales].
         base_z: (n,) residuals of the fit [scales], outliers clipped.
         mean_db: (n,) predicted mean [dB].
         coefficients: coefficients of the fit, levels first.
@@ -270,7 +270,7 @@ def _slopes(fit: Fit) -> Columns:
     if not centre.is_same(effect):  # varied with faster levels than it was fitted with
         model = model.with_effect_at(-1, centre)
     mean_db, slopes_db = model.training.predict(fit).mean_db, []
-    # With paths, the step is the one of the folds, whose paths are then computed already.
+    # For paths, take the step that the folds use, for which the paths are computed already.
     share = NEAR_SHARE if variation.follows_paths else STEP_SHARE
     for number, step in enumerate(share * variation.steps):
         values = variation.values.copy()

@@ -1,7 +1,7 @@
 """Posterior probabilities: of an effect, of nothing, and of a cause that is not in the catalogue.
 
 A logistic regression turns four kinds of numbers into a probability (Platt 1999, 'Probabilistic
-outputs for support vector machines'): the evidence beside a correlated residual, the held-out gain,
+outputs for support vector machines'): the evidence given correlated residuals, the held-out gain,
 the ratio of place-bound residual to noise, and whether another kind of effect was found already. It
 was fitted to ray-traced cases with known effects (`tests/undeclared`, and the foreign cities for
 calibration; `python -m studies foreign` tests it on other cities). The weights are in
@@ -127,8 +127,8 @@ def features(nats: tuple[float, float, float], rest_over_noise: float,
     """Return the five features from which a logistic regression predicts an effect's probability.
 
     Args:
-        nats: evidence with a correlated residual as the alternative, gain on held-out links, and
-            lead of the evidence over the best other effect that passed [nats].
+        nats: evidence given correlated residuals, gain on held-out links, and lead of the evidence
+            over the best other effect that passed [nats].
         rest_over_noise: sd of the residual that depends on the place over the sd of noise.
         is_another_kind: whether an effect of another name was found already.
     """

@@ -1,6 +1,6 @@
 """Sensitivity of the search: the least size of each effect that would have been named.
 
-For a typical pattern of each effect, the Fisher information beside the nuisances (`hypotheses`)
+For a typical pattern of each effect, the Fisher information given the nuisances (`hypotheses`)
 gives the size from which the expected evidence makes it probable enough. An effect's search has
 further conditions, for example that devices agree. So the pattern is also added to the residual,
 larger and larger, until the search finds it. Smaller effects may be present and are not named.
