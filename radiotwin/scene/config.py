@@ -302,7 +302,7 @@ def parse_config(data: dict[str, Any], path: Path | str) -> SceneConfig:
             budget.check(len(data[name]), path)
     try:
         return SceneConfig.model_validate(data)
-    except BadInput as bad:  # a budget
+    except BadInput as bad:  # a limit is exceeded
         raise BadInput(f"{path}: {bad}") from None
     except ValidationError as error:
         raise BadInput(_explain(Path(path), error)) from None

@@ -229,7 +229,7 @@ def _with_left_out_corners(triangles: np.ndarray, ends: Sequence[int]) -> np.nda
         known = sum((a * n + b in border) - (b * n + a in border) for a, b in forth.items())
         ahead |= forth if known >= 0 else {b: a for a, b in forth.items()}
     added = []
-    for edge in border:  # from a straight to b: a fan at a over the corners between them
+    for edge in border:  # an edge that skips corners of the ring: fill them in by a fan at a
         a, b = divmod(edge, n)
         corner = ahead[a]
         while corner != b and corner != a:

@@ -84,7 +84,7 @@ def mended(diffraction: str) -> Iterator[None]:
         diffracted = found.sampled_component == InteractionType.DIFFRACTION
         outward = drjit.normalize(wedges.n0 + wedges.nn)
         si.p = drjit.select(diffracted, si.p + 1e-3 * outward, si.p)
-        si.n = drjit.select(diffracted, 0.0, si.n)  # otherwise rays start farther off, along it
+        si.n = drjit.select(diffracted, 0.0, si.n)  # a normal would move the ray's start farther
         return found, normal, wedges
 
     changed = ((Search, "_sample_radio_material", sample_outwards),

@@ -206,7 +206,7 @@ def distinct_paths(interactions: np.ndarray, vertices_m: np.ndarray, length_m: n
     direct = exists & ~used.any(axis=0)
     keep = exists & ~direct
     straightest = np.where(direct, cos_turn, np.inf).argmin(axis=1) if direct.any() else 0
-    links = np.flatnonzero(direct.any(axis=1))  # of their direct paths the straightest stays
+    links = np.flatnonzero(direct.any(axis=1))  # the straightest of their direct paths counts
     keep[links, np.broadcast_to(straightest, len(direct))[links]] = True
 
     link, path = np.nonzero(exists & ~direct)

@@ -291,7 +291,7 @@ def _polygons(shape: Any) -> BaseGeometry | None:
         return shapely.Polygon(np.concatenate(parts))
     rings = [ring for ring in parts if len(ring) > 3]
     turns = np.array([_turn(ring) for ring in rings])
-    if turns.max(initial=0.0) > -turns.min(initial=0.0):  # the largest is reversed: so are all
+    if turns.max(initial=0.0) > -turns.min(initial=0.0):  # all rings are reversed
         turns = -turns
     outlines = [shapely.Polygon(ring) for ring, turn in zip(rings, turns) if turn <= 0]
     holes = [ring for ring, turn in zip(rings, turns) if turn > 0]

@@ -308,12 +308,12 @@ def _vertical(path: Path, file: Any, system: "CRS",
         system.axis_info[2] if len(system.axis_info) == 3 else None)
     unit = (file.units[0] or "").strip().lower()
     plan_m = plane_unit_m(system)
-    if not unit and axis is None:  # programs take the plan's unit, or metres
+    if not unit and axis is None:  # no unit: some programs take the plan's, some metres
         if declared is None and plan_m != 1.0:
             raise BadInput(f"{path} names no unit of its heights, and its plan is in feet or "
                            f"another unit ({plan_m:.7g} m); say --terrain-unit ft or "
                            "--terrain-unit m")
-        is_foot = abs(plan_m - FOOT_M) < 1e-3  # of a survey, or the international one
+        is_foot = abs(plan_m - FOOT_M) < 1e-3  # US survey or international foot
         factor = plan_m if declared == "ft" and is_foot else UNITS_M[declared or "m"]
     elif declared is not None:
         raise BadInput(f"{path} names the unit of its heights itself; leave --terrain-unit out, or "
@@ -522,7 +522,7 @@ def raise_to_terrain(prisms: Sequence[Prism], ground: Ground) -> list[Prism]:
         low_m, height = round(lowest_m[id(prism.site or prism.area)], 3), prism.height
         bottom_m = low_m + height.bottom_m if height.bottom_m > 0 else low_m - SKIRT_M
         body = prism.body
-        if body is not None and body.mesh is not None:  # a solid one follows its height
+        if body is not None and body.mesh is not None:  # a closed one is moved by its height later
             body = replace(body, mesh=(body.mesh[0] + [0.0, 0.0, low_m], body.mesh[1]))
         stood.append(replace(prism, ground_m=low_m, body=body, height=replace(
             height, bottom_m=bottom_m, top_m=low_m + height.top_m)))
