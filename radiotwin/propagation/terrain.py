@@ -75,7 +75,7 @@ def terrain_paths(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray,
 
 def _profiles(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray
               ) -> Iterator[tuple[np.ndarray, Profiles]]:
-    """Yield rows of receivers, and their profiles, in chunks.
+    """Yield chunks of terrain profiles from a device (3,) to receivers (n, 3) [m], with their rows.
 
     The number of points depends on the length only, so that exchanged ends have the same profile.
     """
@@ -95,7 +95,7 @@ def _profiles(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray
 
 
 def delta_bullington_db(profiles: Profiles, frequency_hz: float) -> np.ndarray:
-    """Return the delta-Bullington loss (n,) in excess of free space [dB] ([1], section 4.5.2)."""
+    """Return the delta-Bullington loss (n,) over free space [dB] (ITU-R P.526-15, 4.5.2)."""
     wavelength_m = speed_of_light / frequency_hz
     above_m = np.maximum(profiles.end_m - _smooth_m(profiles), MIN_HEIGHT_M)
     flat_db = _bullington_db(profiles, np.zeros_like(profiles.surface_m), above_m, wavelength_m)
@@ -112,7 +112,7 @@ def knife_edge_db(nu: np.ndarray) -> np.ndarray:
 
 def _edges(profiles: Profiles, height_m: np.ndarray,
            end_m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the links that are blocked, and the points where the horizons of their ends meet.
+    """Return the links that are blocked, and where the horizons of their two ends meet.
 
     Args:
         profiles: profiles of n links.
@@ -121,7 +121,7 @@ def _edges(profiles: Profiles, height_m: np.ndarray,
 
     Returns:
         (n,) bool, blocked; for the m blocked links, distances (m,) from the first end and heights
-        (m,) of the meeting point [m].
+        (m,) of the meeting point, which is Bullington's single knife edge [m].
     """
     at_m, back_m = profiles.at_m, profiles.length_m[:, None] - profiles.at_m
     curved_m = height_m + at_m * back_m / (2 * EARTH_RADIUS_M)
@@ -135,9 +135,9 @@ def _edges(profiles: Profiles, height_m: np.ndarray,
 
 def _bullington_db(profiles: Profiles, height_m: np.ndarray, end_m: np.ndarray,
                    wavelength_m: float) -> np.ndarray:
-    """Return the Bullington loss (n,) of profile heights (n, p) between antennas at heights (n, 2).
+    """Return the Bullington loss (n,) [dB], by one knife edge (ITU-R P.526-15, 4.5.1).
 
-    In decibels, heights in metres ([1], section 4.5.1).
+    `height_m` (n, p) are the heights of the profile, `end_m` (n, 2) those of both antennas [m].
     """
     length_m = profiles.length_m[:, None]
 
@@ -158,7 +158,10 @@ def _bullington_db(profiles: Profiles, height_m: np.ndarray, end_m: np.ndarray,
 
 
 def _smooth_m(profiles: Profiles) -> np.ndarray:
-    """Fit a smooth Earth to the ground; return its heights (n, 2) at the ends [m] ([1], 4.5.2)."""
+    """Fit a smooth surface to the ground; return its heights (n, 2) at both ends [m].
+
+    By ITU-R P.526-15, 4.5.2; lowered if the ground blocks the link, and never above the ground.
+    """
     length_m, end_m, ground_m = profiles.length_m[:, None], profiles.end_m, profiles.ground_m
     at_m = np.column_stack([np.zeros(len(length_m)), profiles.at_m, length_m])
     step_m, low_m, high_m = np.diff(at_m), ground_m[:, :-1], ground_m[:, 1:]
@@ -180,7 +183,7 @@ def _smooth_m(profiles: Profiles) -> np.ndarray:
 
 def spherical_earth_db(distance_m: np.ndarray, height_m: np.ndarray,
                        frequency_hz: float) -> np.ndarray:
-    """Return the diffraction loss (n,) over a smooth Earth of 4/3 radius [dB] ([1], section 3.2).
+    """Return the diffraction loss (n,) over a smooth 4/3 Earth [dB] (ITU-R P.526-15, 3.2).
 
     Args:
         distance_m: (n,) horizontal distance [m].
@@ -208,7 +211,7 @@ def spherical_earth_db(distance_m: np.ndarray, height_m: np.ndarray,
 
 def _first_term_db(distance_m: np.ndarray, height_m: np.ndarray, frequency_hz: float,
                    radius_m: np.ndarray) -> np.ndarray:
-    """Return the loss (n,) by the first term of the residue series [dB] ([1], Eq. 13 to 19)."""
+    """Return the loss (n,) over a smooth Earth by the first residue term [dB] (P.526-15, 3.1)."""
     wavelength_m = speed_of_light / frequency_hz
     imaginary = CONDUCTIVITY_S_M * 18e9 / frequency_hz
     admittance = (0.36 * (radius_m / 1e3 * frequency_hz / 1e6) ** (-1 / 3)

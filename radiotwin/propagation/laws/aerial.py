@@ -87,6 +87,7 @@ class _AlHourani(PublishedLaw):
 
     @override
     def branch(self, links: LinkGeometry, los: bool) -> Branch:
+        """Return free-space plus mean excess loss, and a spread that falls with elevation [dB]."""
         excess_db, sd_db, decay = (
             np.interp(np.log(self.frequency_hz), np.log(FREQUENCIES_HZ), values[0 if los else 1])
             for values in self.environment[2:])
@@ -152,6 +153,7 @@ class _Urban3gpp(PublishedLaw):
 
     @override
     def validity(self, links: LinkGeometry) -> Validity:
+        """Return the ranges of TR 36.777 for aerial receivers, of TR 38.901 for other links."""
         aerial = self._is_aerial(links)
         hidden = aerial & ~links.los if self.with_map else np.zeros(len(links), dtype=bool)
         return Validity(
@@ -196,6 +198,7 @@ class UrbanMacro(_Urban3gpp):
 
     @override
     def branch(self, links: LinkGeometry, los: bool) -> Branch:
+        """Return the UMa path loss and shadowing sd [dB] of aerial receivers, or of terminals."""
         high_m, low_m = self._ends_m(links)
         aerial, log_d = self._is_aerial(links), links.log_distance
         los_db = np.where(aerial, 28.0 + 22 * log_d + 20 * self._log_ghz(),  # Table B-2
@@ -210,6 +213,7 @@ class UrbanMacro(_Urban3gpp):
 
     @override
     def los_probability(self, links: LinkGeometry) -> np.ndarray:
+        """Return the UMa LoS probability (n,): TR 36.777 if aerial, else TR 38.901."""
         high_m, low_m = self._ends_m(links)
         flat_m = ground_m(links)
         height = np.log10(np.maximum(high_m, AERIAL_M))
@@ -232,6 +236,7 @@ class UrbanMicro(_Urban3gpp):
 
     @override
     def branch(self, links: LinkGeometry, los: bool) -> Branch:
+        """Return the UMi path loss and shadowing sd [dB] of aerial receivers, or of terminals."""
         high_m, low_m = self._ends_m(links)
         aerial, log_d = self._is_aerial(links), links.log_distance
         height = np.log10(high_m)
@@ -248,6 +253,7 @@ class UrbanMicro(_Urban3gpp):
 
     @override
     def los_probability(self, links: LinkGeometry) -> np.ndarray:
+        """Return the UMi LoS probability (n,): TR 36.777 if aerial, else TR 38.901."""
         high_m, flat_m = self._ends_m(links)[0], ground_m(links)
         height = np.log10(np.maximum(high_m, AERIAL_M))
         above = _los_probability(flat_m, np.maximum(294.05 * height - 432.94, 18.0),

@@ -75,7 +75,7 @@ class ChannelModel(ABC):
 
     @property
     def trend(self) -> ChannelModel:
-        """Return the part without residuals of single devices; by default the model itself.
+        """Return the model without interpolated residuals of single devices; by default itself.
 
         It predicts devices that were never measured as well as those that were.
         """
@@ -87,11 +87,11 @@ class ChannelModel(ABC):
         return self
 
     def level_at(self, links: Links, exact: bool = False) -> np.ndarray:
-        """Return the mean level (n,) [dB] of measured links with declared antennas and powers.
+        """Return the mean level (n,) [dB] of links, including declared antennas and powers.
 
         Args:
             links: n links.
-            exact: False: by the faster model `quick`.
+            exact: True: by this model; False: by its faster approximation `quick`.
         """
         channel = self if exact else self.quick
         return channel.predict(links.geometry)[0] + channel.declared_db(links)

@@ -102,9 +102,9 @@ def declared_antenna_db(links: Links) -> np.ndarray | float:
 
 
 def free_space_gains(geometry: LinkGeometry) -> np.ndarray:
-    """Return the free-space power gain (n,) of links over a map, linear (ITU-R P.525); 0 without.
+    """Return the free-space power gain (n,) of links, linear (ITU-R P.525); 0 if there is no map.
 
-    Without a map there are no scattered paths, whose power is relative to it.
+    It is the reference of the power of scattered paths, which exist only over a map.
     """
     if geometry.city is None:
         return np.zeros(len(geometry))
@@ -210,7 +210,12 @@ _remembered: OrderedDict[tuple[CityMap, _Position, float], _Followed] = OrderedD
 
 
 def _by_device(geometry: LinkGeometry) -> Iterator[tuple[np.ndarray, _Followed, np.ndarray]]:
-    """Yield for each device the rows of its links, its cached paths, and the links' rows there."""
+    """Yield the cached paths of the links, device by device.
+
+    Yields:
+        rows of the device's links in `geometry`, its cached paths, and the row of each of these
+        links in them.
+    """
     city = geometry.city
     if city is None:
         raise BadInput("the model paths follows paths over a 3D map, and none is given; "
@@ -226,9 +231,10 @@ def _by_device(geometry: LinkGeometry) -> Iterator[tuple[np.ndarray, _Followed, 
 
 
 def followed_from_m(geometry: LinkGeometry, row: int) -> _Position:
-    """Return the position from which paths of a link's device are traced [m].
+    """Return the position from which the paths of the device of link `row` are traced [m].
 
-    It is the device's, rounded to GRID_M if estimated and if the rounded one is not in a building.
+    An estimated position is rounded to GRID_M, unless that lies in a building, so that estimates
+    close together share cached paths. A declared position is taken as it is.
     """
     assert geometry.city is not None
     position_m = geometry.device_m[row]
@@ -244,7 +250,8 @@ def _follow(city: CityMap, wanted: list[tuple[_Position, np.ndarray]],
     """Return the paths from positions to their receivers (n, 3) [m], cached or newly traced.
 
     Returns:
-        for each position its cached paths, and the row (n,) of each receiver in them.
+        for each wanted position its entry of the cache, and the row (n,) of each receiver in that
+        entry.
     """
     nothing = _Followed(np.zeros(0, dtype=np.int64), np.zeros((0, len(COMPONENTS))),
                         _packed(NO_DIRECTIONS))
@@ -383,11 +390,11 @@ class KnownPaths:
         self._paths: tuple[np.ndarray, ...] = ()  # link, power, points, number of points; (p, ...)
 
     def past(self, box: UprightBox, rows: np.ndarray) -> Power:
-        """Return the power of links `rows` (r,), in total and of paths that a box does not block.
+        """Return the power gains of links `rows` (r,) with and without the paths that a box blocks.
 
         Args:
-            box: the box.
-            rows: (r,) indices of links.
+            box: upright box, such as an unknown building.
+            rows: (r,) indices of links; paths that were not traced yet are traced first.
         """
         self.follow(rows)
         if not self._paths:
@@ -399,7 +406,10 @@ class KnownPaths:
                      np.bincount(link, power_past, n)[rows])
 
     def follow(self, rows: np.ndarray) -> None:
-        """Trace the paths of links `rows` (r,) that were not traced before."""
+        """Trace and store the paths of those links `rows` (r,) that were not traced before.
+
+        Paths weaker than WEAKEST times the strongest path of their link are dropped.
+        """
         geometry, parts = self._geometry, [self._paths] if self._paths else []
         rows = rows[~self._is_followed[rows]]
         if not len(rows):

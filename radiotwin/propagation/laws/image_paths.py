@@ -101,7 +101,7 @@ class LinkFit:
 
     def fit(self, los: np.ndarray, paths_db: np.ndarray, square_db: np.ndarray | None = None
             ) -> tuple[np.ndarray, np.ndarray]:
-        """Fit LoS and NLoS links separately.
+        """Fit level offset and error scale to the LoS and to the NLoS links; return the misfit.
 
         Args:
             los: (n,) bool, line of sight.
@@ -159,7 +159,7 @@ class ImagePaths(ChannelModel):
 
     def fit_diffuse(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
                     antenna_db: np.ndarray | float = 0.0) -> Self:
-        """Fit the diffuse power, and a level, to the NLoS links.
+        """Fit gain and exponent of the diffuse power to the NLoS links; a level offset is free.
 
         Args:
             links: n links.
@@ -229,6 +229,7 @@ class ImagePaths(ChannelModel):
 
     @override
     def level_columns(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
+        """Return a level and a slope for LoS and for NLoS; priors keep the slopes small."""
         # Slopes: errors of materials and walls add up along a path.
         los, slope = links.los, np.log10(links.distance_m / 100.0)
         columns = np.column_stack([los, ~los, los * slope, ~los * slope])
@@ -244,6 +245,7 @@ class ImagePaths(ChannelModel):
     @classmethod
     @override
     def from_state(cls, arrays: dict[str, np.ndarray], settings: dict[str, Any]) -> Self:
+        """Restore the model from its `state`, after checking it."""
         require_names("settings", settings, ["law", "law_settings", "diffuse"])
         if settings["law"] != SegmentedLogDistance.name:
             raise ValueError(f"law is not {SegmentedLogDistance.name!r}")
@@ -252,7 +254,7 @@ class ImagePaths(ChannelModel):
 
 
 def _seen_gains(links: LinkGeometry) -> np.ndarray:
-    """Return the summed power gain (n,) of paths, with a direct path only for links with `los`.
+    """Return the summed power gain (n,) of paths, linear; the direct path counts if `links.los`.
 
     `links.los` may differ from the map: an effect adds or removes an obstacle, or paths start at
     the rounded position. Then the direct path is dropped, or added with its free-space gain.
@@ -274,8 +276,8 @@ def stored_diffuse(value: Any) -> tuple[float, float]:
 def _clip_diffuse(numbers: np.ndarray, near_m: float, frequency_hz: float) -> np.ndarray:
     """Clip gain at 100 m [dB] and exponent (2,) of diffuse power to DIFFUSE_BOUNDS.
 
-    Beyond `near_m` it also stays MIN_LOSS_DB below free space. Otherwise it would replace the
-    paths, also those of LoS links: the NLoS level is fitted together with it.
+    Diffuse power must also stay MIN_LOSS_DB below free space beyond `near_m`. Otherwise it would
+    replace the traced paths, also of LoS links, since the NLoS level is fitted together with it.
     """
     gain_db, exponent = np.clip(numbers, *DIFFUSE_BOUNDS)
     max_gain_db = -free_space_db(np.array(100.0), frequency_hz) - MIN_LOSS_DB \

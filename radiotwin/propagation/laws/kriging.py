@@ -133,7 +133,11 @@ class ResidualField:
 
     def _store(self, series: np.ndarray, position_m: np.ndarray, residual: np.ndarray,
                kind: np.ndarray) -> dict[int, np.ndarray]:
-        """Merge and store the points, given as in `fit`; return the rows of each series."""
+        """Merge and store points, given as in `fit`, in `fields`; return the rows of each series.
+
+        Points within SAME_POINT_M are averaged. In a field that is not local, the cells grow until
+        no series has too many points.
+        """
         rows_of_series = _rows_by_series(series)
         max_points = self._max_points(len(rows_of_series))
         self.fields = {}
@@ -167,7 +171,7 @@ class ResidualField:
 
     def mean(self, series: np.ndarray, position_m: np.ndarray,
              kind: np.ndarray | None = None) -> np.ndarray:
-        """Return the mean of `predict` in less time."""
+        """Return only the posterior mean (n,) of `predict`, which takes less time."""
         mean = np.zeros(len(series))
         for (_, weights), rows, cross in self._batches(series, position_m, kind):
             mean[rows] = weights @ cross
@@ -175,11 +179,11 @@ class ResidualField:
 
     def _batches(self, series: np.ndarray, position_m: np.ndarray, kind: np.ndarray | None,
                  ) -> Iterator[tuple[_Solved, np.ndarray, np.ndarray]]:
-        """Yield batches to predict; arguments as in `fit`.
+        """Split points to predict, given as in `fit`, into batches; unknown series are left out.
 
         Yields:
-            factor and weights of p stored points, rows (b,) to predict from them, and the
-            correlation (p, b) between both.
+            Cholesky factor and kriging weights of p stored points, rows (b,) to predict from them,
+            and the correlation (p, b) between both.
         """
         kind = np.zeros(len(series), dtype=int) if kind is None else kind
         for number, series_rows in _rows_by_series(series).items():
@@ -193,10 +197,11 @@ class ResidualField:
 
     def _neighbourhoods(self, number: int, position_m: np.ndarray, rows: np.ndarray
                         ) -> Iterator[tuple[_Field, _Solved, np.ndarray]]:
-        """Yield stored points of a series, their factor and weights, and the rows to predict.
+        """Yield groups of rows to predict in a series, with the stored points that predict them.
 
-        All rows at once, or for a series with too many points in groups of neighbouring rows, each
-        with its nearest points.
+        Each time: stored points, their Cholesky factor and kriging weights, and the rows. All
+        stored points predict all rows; if there are too many, groups of neighbouring rows use their
+        nearest points.
         """
         field = self.fields[number]
         if number in self._solved or len(field.residual) <= LOCAL_POINTS:
@@ -262,14 +267,20 @@ class ResidualField:
         return correlation
 
     def _covariance(self, field: _Field, distance_m: np.ndarray) -> np.ndarray:
-        """Return the covariance (p, p) of points with the nugget, from distances (p, p) [m]."""
+        """Return the covariance (p, p) of stored points at distances (p, p) [m].
+
+        A point that is the mean of several measurements has that much less of the nugget.
+        """
         covariance = self._correlation(distance_m, field.kind, field.kind)
         nugget = (1 - self.share - self.kind_share) / field.count
         covariance.ravel()[::len(covariance) + 1] += nugget + 1e-8  # keeps it positive definite
         return covariance
 
     def _fit_correlation(self, fields: list[_Field], kinds: bool) -> None:
-        """Maximise the marginal likelihood of the points (Rasmussen and Williams 2006, eq. 5.8)."""
+        """Set `share`, `length_m` and, with `kinds`, `kind_share` by marginal likelihood.
+
+        Rasmussen and Williams 2006, eq. 5.8.
+        """
         distances_m = [cdist(field.position_m, field.position_m) for field in fields]
         max_m = max(float(distance_m.max()) for distance_m in distances_m)
         if max_m == 0.0:
@@ -319,7 +330,7 @@ class ResidualField:
 
 
 def _rows_by_series(series: np.ndarray) -> dict[int, np.ndarray]:
-    """Return the rows of each series, ascending, by index of the series."""
+    """Return a dict from each series, such as a device, to its ascending rows."""
     order = np.argsort(series, kind="stable")
     numbers, first = np.unique(series[order], return_index=True)
     return {int(number): order[start:start + count] for number, start, count in
@@ -355,10 +366,10 @@ def _sample(field: _Field, rng: np.random.Generator) -> _Field:
 
 
 def _fixed_receivers_m(links: LinkGeometry) -> np.ndarray:
-    """Return positions (k, 3) of fixed receivers of moving devices [m]; (0, 3) if receivers move.
+    """Return positions (k, 3) of fixed receivers [m] if devices move; (0, 3) if receivers move.
 
-    Receivers count as fixed if, in the median over links, a receiver's position heard more devices
-    than the device was heard from positions.
+    Devices move if, for the median link, the receiver's position heard more devices than there are
+    positions that heard the link's device.
     """
     cells, place = np.unique(np.round(links.receiver_m / SAME_PLACE_M), axis=0,
                              return_inverse=True)
@@ -408,14 +419,21 @@ class RegressionKriging(ChannelModel):
 
     def _residual(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
                   ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Fit the law; return series (m,), positions (m, 3) [m] and residuals (m,) of links."""
+        """Fit the log-distance law to links and compute their residuals, for `ResidualField.fit`.
+
+        Returns series (m,), positions (m, 3) [m] and residuals (m,) in standard deviations.
+        """
         links, level_db, limit_db = drop_uninformative(links, level_db, limit_db)
         self.law.fit(links, level_db, limit_db)
         mean_db, sd_db = self.law.predict(links)
         return *self._ends(links), standardised(level_db, mean_db, sd_db, limit_db)
 
     def _ends(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
-        """Return series (n,) and positions (n, 3) [m] of links, see `_fixed_receivers_m`."""
+        """Return series (n,) and positions (n, 3) [m] of links, where residuals are interpolated.
+
+        These are device and receiver position. If devices move, they are the fixed receiver and the
+        device's position; other receivers share one series.
+        """
         if not len(self.fixed_m):
             return links.device, links.receiver_m
         away_m, nearest = cKDTree(self.fixed_m).query(links.receiver_m)
@@ -434,6 +452,7 @@ class RegressionKriging(ChannelModel):
 
     @override
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Return arrays and settings of law and residual field together, for `from_state`."""
         arrays, settings = self.law.state()
         field_arrays, field_settings = self.field.state()
         if len(self.fixed_m):
@@ -443,6 +462,7 @@ class RegressionKriging(ChannelModel):
     @classmethod
     @override
     def from_state(cls, arrays: dict[str, np.ndarray], settings: dict[str, Any]) -> Self:
+        """Restore law and residual field from their `state`, after checking them."""
         model = cls()
         law = {"lines": arrays["lines"]}
         model.law = SegmentedLogDistance.from_state(law, {"borrowed": settings["borrowed"]})

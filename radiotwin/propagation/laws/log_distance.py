@@ -86,6 +86,7 @@ class SegmentedLogDistance(ChannelModel):
     @override
     def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
             seed: int = 0) -> Self:
+        """Fit a line to LoS links and one to NLoS links; warn if one has to be borrowed."""
         links, level_db, limit_db = drop_uninformative(links, level_db, limit_db)
         data = {
             name: (links.log_distance[rows], level_db[rows], limit_db[rows])
@@ -125,6 +126,7 @@ class SegmentedLogDistance(ChannelModel):
     @classmethod
     @override
     def from_state(cls, arrays: dict[str, np.ndarray], settings: dict[str, Any]) -> Self:
+        """Restore the law from its `state`, after checking it."""
         require_names("settings", settings, ["borrowed"])
         require_names("arrays", arrays, ["lines"])
         nlos, los = map(_line, require_array(arrays, "lines", (2, 3), -MAX_DB, MAX_DB))

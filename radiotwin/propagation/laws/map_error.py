@@ -74,9 +74,11 @@ class _Sizes:
 
 def _estimate_sizes(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
                     diffuse: tuple[float, float], offsets_db: Offsets, seed: int) -> _Sizes:
-    """Estimate the standard deviations of walls and heights by maximum likelihood.
+    """Estimate standard deviations of wall positions and roof heights by maximum likelihood.
 
-    `diffuse` and `offsets_db` are those of `paths_db`; `seed` is of the random maps.
+    Each tried pair adds to the error variance of a link the mean square change of its level over
+    random maps with such errors. `diffuse` and `offsets_db` are those of `paths_db`; `seed` is of
+    the maps.
     """
     power, fit = (diffuse, offsets_db), LinkFit(level_db, limit_db)
     base_db = paths_db(links, *power)
@@ -120,9 +122,14 @@ def _estimate_sizes(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
 def _mean_square_db(links: LinkGeometry, base_db: np.ndarray,
                     power: tuple[tuple[float, float], Offsets], size_m: tuple[float, float],
                     seed: int) -> np.ndarray:
-    """Return the mean square change (n,) [dB²] of levels over random maps, from `base_db` (n,).
+    """Return the mean square level change (n,) [dB²] from a map to random wrong copies of it.
 
-    `size_m` are the standard deviations of walls and heights, `power` the arguments of `paths_db`.
+    Args:
+        links: n links over the map.
+        base_db: (n,) levels over the given map [dB].
+        power: diffuse power and offsets, arguments of `paths_db`.
+        size_m: standard deviations of walls and of heights in the copies [m].
+        seed: of the copies.
     """
     city = links.city
     if city is None or not any(size_m):
@@ -137,7 +144,7 @@ def _mean_square_db(links: LinkGeometry, base_db: np.ndarray,
 
 
 def _size(best: np.intp, likely: np.ndarray, scale_m: tuple[float, ...]) -> Size:
-    """Convert best and `likely` steps on a scale of sizes to estimate and 90 % interval [m]."""
+    """Convert best and `likely` steps on a scale of sizes to an estimate and 90 % interval [m]."""
     steps = np.array([best, likely[0] - 1, likely[-1] + 1]) / STEPS
     size_m, low_m, high_m = np.interp(steps, np.arange(len(scale_m)), scale_m).tolist()
     return size_m, low_m, high_m
@@ -150,9 +157,10 @@ def estimate_shift(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit, s
     Arguments are those of `estimate_map_error`.
 
     Returns:
-        the shift; zeros if there are too few links or no shift. Errors of single walls look like a
-        different shift around each device. So the shift found from the other devices must raise
-        the likelihood of each left-out device, and must explain more than errors of walls do.
+        shift east and north and 90 % radius [m]; zeros if there are too few links, or it is not
+        significant. Wrong walls look like a different shift around each device. So the shift found
+        without a device must raise that device's likelihood, tested over all devices, and explain
+        more than errors of walls do.
     """
     limits_db = limits_of(limit_db, len(links))
     known = np.isfinite(level_db) | np.isfinite(limits_db)
@@ -191,7 +199,7 @@ def estimate_shift(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit, s
 
 
 def _random_rows(known: np.ndarray, count: int, seed: int) -> np.ndarray:
-    """Draw at most `count` links where `known` (n,) is True; none if fewer than MIN_LINKS."""
+    """Draw at most `count` of the rows where `known` (n,); none if fewer than MIN_LINKS."""
     rows = np.flatnonzero(known)
     if len(rows) < MIN_LINKS:
         return rows[:0]

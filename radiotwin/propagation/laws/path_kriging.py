@@ -81,6 +81,7 @@ class PathKriging(ChannelModel):
     @override
     def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
             seed: int = 0) -> Self:
+        """Fit map errors (unless given), both predictions and their weights."""
         links, level_db, limit_db = drop_uninformative(links, level_db, limit_db)
         self.seed = seed
         sure = ~np.isin(links.device, self.lost)
@@ -98,6 +99,7 @@ class PathKriging(ChannelModel):
 
     @override
     def predict(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
+        """Predict by the mixture of traced paths and kriging; `lost` devices by kriging alone."""
         links = self.map_error.on_map(links)
         mean_db, sd_db = self.kriging.predict(links)
         sure = np.flatnonzero(~np.isin(links.device, self.lost))
@@ -127,7 +129,11 @@ class PathKriging(ChannelModel):
         return self.kriging.law
 
     def _over_maps(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean (n,) [dB] and variance (n,) [dB²] of computed levels over possible maps."""
+        """Return mean (n,) [dB] and variance (n,) [dB²] of path levels over maps that may be true.
+
+        These are the given map and copies with random errors of the estimated sizes. Without such
+        errors there are no copies, and the variance is 0.
+        """
         power = self.diffuse, self.map_error.offsets_db
         levels_db = [paths_db(links, *power)]
         if self.map_error.is_seen and links.city is not None:
@@ -141,7 +147,10 @@ class PathKriging(ChannelModel):
 
     def _fit_classes(self, links: LinkGeometry, level_db: np.ndarray, limit_db: np.ndarray,
                      mean_db: np.ndarray, square_db: np.ndarray) -> None:
-        """Fit `classes`; NLoS or LoS without a detected link takes the numbers of the other."""
+        """Set `classes`: level offset and error scale [dB] of NLoS and LoS links.
+
+        If one class has no detected link, it takes the numbers of the other.
+        """
         detected = [bool(np.isfinite(level_db[links.los == los]).any()) for los in (False, True)]
         for los in (0, 1):
             if detected[los]:
@@ -160,10 +169,10 @@ class PathKriging(ChannelModel):
 
     def _held_out_weight(self, links: LinkGeometry, level_db: np.ndarray, limit_db: np.ndarray,
                          mean_db: np.ndarray, square_db: np.ndarray) -> np.ndarray:
-        """Return the weights (2,) of traced paths, for NLoS and LoS, with least held-out error.
+        """Return the weights (2,) of traced paths against kriging, in NLoS and LoS, in 0..1.
 
-        Least squares over the detected links in held-out squares of ground, clipped to 0..1. The
-        kriging correlations stay those of all links.
+        They minimise the squared error on detected links in held-out squares of ground, which
+        neither interpolation has seen. `mean_db` and `square_db` are from `_over_maps`.
         """
         square = np.floor(links.receiver_m[:, :2] / BLOCK_M)
         label = np.unique(square, axis=0, return_inverse=True)[1].reshape(-1)
@@ -193,6 +202,7 @@ class PathKriging(ChannelModel):
 
     @override
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Return arrays and settings of all parts, for `from_state`."""
         paths, paths_settings = self.field.state()
         law, law_settings = self.kriging.state()
         arrays = {f"paths/{name}": value for name, value in paths.items()} \
@@ -205,6 +215,7 @@ class PathKriging(ChannelModel):
     @classmethod
     @override
     def from_state(cls, arrays: dict[str, np.ndarray], settings: dict[str, Any]) -> Self:
+        """Restore the model from its `state`, after checking it."""
         require_names("settings", settings, ["diffuse", "map_error", "lost", "paths", "law",
                                               "seed"])
         strange = [name for name in arrays if name not in ("classes", "weight")

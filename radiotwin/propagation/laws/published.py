@@ -133,9 +133,10 @@ class PublishedLaw(ChannelModel):
 
     @override
     def predict(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
-        """Predict mean and standard deviation (n,) [dB] of the mixture of both branches.
+        """Predict mean and standard deviation (n,) [dB] by the LoS and NLoS branches.
 
-        The variance is the mean of both variances plus the variance between the two medians.
+        LoS has the weight 1 or 0 by the map, or else its published probability. The variance is the
+        mean of both variances plus the variance between the two medians.
         """
         los, nlos = self.branch(links, True), self.branch(links, False)
         share = links.los.astype(float) if self.with_map else self.los_probability(links)
@@ -145,7 +146,7 @@ class PublishedLaw(ChannelModel):
         return self.power_dbm - loss_db, np.sqrt(variance)
 
     def outside(self, links: LinkGeometry) -> list[str]:
-        """Return a message for each quantity that is outside the law's validity for some links."""
+        """Return a message for each quantity, such as distance, outside its published range."""
         found = []
         for what, value, least, greatest, unit in self._quantities(links):
             odd = (value < least) | (value > greatest)
@@ -171,7 +172,7 @@ class PublishedLaw(ChannelModel):
 
     def _quantities(self, links: LinkGeometry,
                     ) -> list[tuple[str, np.ndarray, np.ndarray, np.ndarray, str]]:
-        """Return name, value, least and greatest published value, (n,) each, and unit."""
+        """List name, value, least and greatest published value (n,), and unit of all quantities."""
         high_m, low_m = ends_m(links)
         valid = self.validity(links)
         least_hz, greatest_hz = valid.frequency_hz
@@ -194,6 +195,7 @@ class PublishedLaw(ChannelModel):
     @classmethod
     @override
     def from_state(cls, arrays: dict[str, np.ndarray], settings: dict[str, Any]) -> Self:
+        """Restore the law from its `state`, after checking it against the law's ranges."""
         require_names("arrays", arrays, [])
         require_names("settings", settings, ["frequency_hz", "with_map", "roof_m", "power_dbm"])
         if not isinstance(settings["with_map"], bool):
@@ -236,7 +238,7 @@ def free_space_db(distance_m: np.ndarray, frequency_hz: float) -> np.ndarray:
 
 
 def mean_roof_m(city: CityMap) -> float:
-    """Return the mean height of a map's roofs above the ground [m]; 0 without buildings."""
+    """Return the mean height of a map's roofs over MIN_ROOF_M above the ground [m]; 0: none."""
     low_m, high_m = city.vertices[:, :2].min(axis=0), city.vertices[:, :2].max(axis=0)
     share = (np.arange(GRID) + 0.5) / GRID
     x_m, y_m = (low + share * (high - low) for low, high in zip(low_m, high_m, strict=True))
@@ -267,6 +269,7 @@ class WalfischIkegami(PublishedLaw):
 
     @override
     def branch(self, links: LinkGeometry, los: bool) -> Branch:
+        """Return the loss along a street (LoS) or over roofs (NLoS), and its sd [dB]."""
         free_db = free_space_db(links.distance_m, self.frequency_hz)
         if los:
             street_db = (42.6 + 26 * np.log10(links.distance_m / 1e3)
@@ -321,6 +324,7 @@ class P1411(PublishedLaw):
 
     @override
     def validity(self, links: LinkGeometry) -> Validity:
+        """Return the published ranges of frequency and distance: in a street, or over roofs."""
         over, los = self._is_over(links), links.los.astype(int)
         least_m, greatest_m = np.where(over[:, None], np.array(OVER_ROOFS_M)[los],
                                        np.array(BELOW_ROOFS_M)[los]).T
@@ -330,6 +334,7 @@ class P1411(PublishedLaw):
 
     @override
     def branch(self, links: LinkGeometry, los: bool) -> Branch:
+        """Return the loss in a street or, with the higher end above the roofs, over roofs [dB]."""
         over = self._is_over(links)
         alpha, beta_db, gamma, sd_db = np.where(over[:, None], OVER_ROOFS[los], BELOW_ROOFS[los]).T
         loss_db = (10 * alpha * links.log_distance + beta_db

@@ -143,7 +143,7 @@ def decode_both(data: bytes, source: object) -> tuple[ChannelModel, dict[str, np
 
 
 def _try_to_predict(model: ChannelModel) -> None:
-    """Raise ValueError if levels that a model predicts for links without a map are not finite."""
+    """Raise ValueError if a model predicts non-finite levels at a few links without a map."""
     horizontal_m, rise_m = np.tile(_TRIED_M, (2, 1)).T
     count, zero = len(rise_m), np.zeros(len(rise_m))
     links = LinkGeometry(np.zeros((count, 3)), np.column_stack([horizontal_m, zero, rise_m]),

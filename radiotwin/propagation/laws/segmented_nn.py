@@ -111,7 +111,7 @@ def forward(weights: dict[str, torch.Tensor], inputs: torch.Tensor) -> torch.Ten
 
 
 def _start(generator: torch.Generator) -> dict[str, torch.Tensor]:
-    """Return initial weights: random hidden layers, and outputs of zero, which is the law."""
+    """Return initial weights: random hidden layers, outputs of zero: the law without correction."""
     import torch
 
     shapes = {"w1": (INPUTS, HIDDEN), "w2": (HIDDEN, HIDDEN)}
@@ -223,6 +223,7 @@ class SegmentedNN(ChannelModel):
     @override
     def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
             seed: int = 0) -> Self:
+        """Fit the segmented law, train networks on its residuals, and tabulate their mean."""
         require_torch()
         links, level_db, limit_db = drop_uninformative(links, level_db, limit_db)
         self.law.fit(links, level_db, limit_db)
@@ -259,6 +260,7 @@ class SegmentedNN(ChannelModel):
 
     @override
     def predict(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
+        """Return the law's mean plus the tabulated correction, and the sd by class (n,) [dB]."""
         segment = links.los.astype(np.intp)
         scale = (TABLE - 1) / np.maximum(self.high - self.low, 1e-9)
         index, weight = [], []
@@ -309,6 +311,7 @@ class SegmentedNN(ChannelModel):
     @classmethod
     @override
     def from_state(cls, arrays: dict[str, np.ndarray], settings: dict[str, Any]) -> Self:
+        """Restore the model from its `state`, after checking it; fill the table again."""
         model = cls()
         model.law = SegmentedLogDistance.from_state({"lines": arrays["lines"]}, settings)
         require_names("arrays", arrays, ["lines", "low", "high", "residual_db", "sigma_db",
@@ -351,8 +354,9 @@ def _coordinates(links: LinkGeometry) -> np.ndarray:
 
 
 def _folds(links: LinkGeometry, rng: np.random.Generator) -> np.ndarray:
-    """Return the index (n,) of the network that holds out each link.
+    """Return the index (n,) of the network that each link judges, and does not train.
 
-    All links of a block have the same one: early stopping on single links would overfit.
+    Links of a block, one device and a square of ground, stay together: their errors are alike, and
+    early stopping on single links would overfit.
     """
     return deal_groups(ground_blocks(links), MEMBERS, rng)

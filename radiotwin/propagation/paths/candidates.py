@@ -78,7 +78,11 @@ class Ways(NamedTuple):
 
 def _open_ways(city: CityMap, surfaces: Surfaces, before: np.ndarray, edge: np.ndarray,
                device_m: np.ndarray) -> Ways:
-    """Return the ways, of w, by which the device (3,) [m] sees a sampled point of the edge."""
+    """Select the partial paths from the device (3,) [m] to edges that no obstacle blocks.
+
+    A partial path reflects at the facets in a row of `before` (w, a) and ends on the edge in `edge`
+    (w,). It is open if any of the points sampled on the lit part of the edge is visible that way.
+    """
     lit_m, source_m, samples = _lit_parts(surfaces, before, edge, device_m)
     points = PathBuffer.allocate(SAMPLE_CHUNK + int(samples.max(initial=0)))
     reflections = Candidates(before, np.full(len(edge), -1), before[:, :0])
@@ -97,7 +101,11 @@ def _open_ways(city: CityMap, surfaces: Surfaces, before: np.ndarray, edge: np.n
 @njit(cache=True, nogil=True, error_model="numpy")
 def _lit_parts(surfaces: Surfaces, before: np.ndarray, edge: np.ndarray, device_m: np.ndarray
                ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return `lit_m` and `source_m` of `Ways`, and the number of points (w,) to sample."""
+    """Return the part of each edge that the device can light by its reflections (w, 2) [m].
+
+    Also the position and distance of the device's image along and from the edge (w, 2) [m], and the
+    number of points to sample on the lit part (w,). All are 0 if nothing is lit. See `Ways`.
+    """
     image = np.empty((MAX_INTERACTIONS + 1, 3))
     lit_m, source_m = np.zeros((len(edge), 2)), np.zeros((len(edge), 2))
     samples = np.zeros(len(edge), dtype=np.int64)
@@ -123,10 +131,11 @@ def _lit_parts(surfaces: Surfaces, before: np.ndarray, edge: np.ndarray, device_
 def _sample(surfaces: Surfaces, before: np.ndarray, edge: np.ndarray, device_m: np.ndarray,
             lit_m: np.ndarray, samples: np.ndarray, is_seen: np.ndarray, first: int, way: int,
             points: PathBuffer) -> tuple[int, int]:
-    """Fill a buffer with paths to points on lit parts of edges, just off the edge.
+    """Fill a buffer with paths from the device, by reflections, to sampled points of edges.
 
-    Begins at row `way`, and skips ways that are already known to be open. Points are every
-    `SAMPLE_STEP`-th of a way, from number `first` on.
+    A way is a row of `before` and `edge`: facets that reflect, then an edge. Of its `samples`,
+    every `SAMPLE_STEP`-th is tried from number `first` on, just off the edge. Ways in `is_seen` are
+    skipped. Begins at row `way`, and stops when `SAMPLE_CHUNK` paths are found.
 
     Returns:
         The number of paths, and the way with which to continue.
@@ -169,11 +178,11 @@ def _sample(surfaces: Surfaces, before: np.ndarray, edge: np.ndarray, device_m: 
 def _with_facets_after(surfaces: Surfaces, ways: Ways, first: np.ndarray, end: np.ndarray,
                        after: np.ndarray, parent: np.ndarray, depth: int
                        ) -> tuple[np.ndarray, np.ndarray]:
-    """Combine each way to an edge with the sequences of facets after it that rays can reach.
+    """Combine each partial path to an edge with the facet sequences that rays reach after it.
 
     Args:
         surfaces: facets and edges.
-        ways: ways to edges.
+        ways: partial paths from the device, by reflections, to edges.
         first: (e,) first row of each edge in `after`: the empty sequence.
         end: (e,) row after the last one of each edge.
         after: (m, b) facets after an edge; then -1.
@@ -262,9 +271,10 @@ def _sphere(count: int) -> np.ndarray:
 
 def _edge_sequences(city: CityMap, facets: CityFacets, rows: np.ndarray, depth: int
                     ) -> FacetSequences:
-    """Find the sequences of up to `depth` facets that rays from edges (n,) visit.
+    """Shoot rays from edges `rows` (n,), and record the sequences of facets that they hit.
 
-    EDGE_RAYS rays start from each 20 m of an edge, for at most 200 m, spread along it.
+    EDGE_RAYS rays start from each 20 m of an edge, at most 10 times as many, with starts spread
+    along it; each is followed over up to `depth` reflections.
     """
     edges, ends_m = facets.surfaces.edges[rows], facets.edge_ends_m[rows]
     normal_0, normal_n = edges[:, NORMAL_0:NORMAL_0 + 3], edges[:, NORMAL_N:NORMAL_N + 3]
@@ -284,7 +294,7 @@ def _edge_sequences(city: CityMap, facets: CityFacets, rows: np.ndarray, depth: 
 
 def _shoot(city: CityMap, facets: CityFacets, start_m: np.ndarray, direction: np.ndarray,
            source: np.ndarray, sources: int, depth: int, beyond: bool = True) -> FacetSequences:
-    """Trace rays through up to `depth` reflections, and record the facets that they visit.
+    """Trace rays over up to `depth` reflections, and return the sequences of facets they hit.
 
     Args:
         city: 3D map.
@@ -334,7 +344,10 @@ def _shoot(city: CityMap, facets: CityFacets, start_m: np.ndarray, direction: np
 
 def _first_facets(city: CityMap, facets: CityFacets, start_m: np.ndarray, direction: np.ndarray
                   ) -> np.ndarray:
-    """Return (2, n) distance [m] and index of the first facet on rays; -1: none, or its back."""
+    """Return distance [m] and index of the first facet that each ray hits, as (2, n).
+
+    The index is -1 if a ray hits nothing, or the back of a facet. Flat ground is infinite.
+    """
     distance_m, face, cosine = city.first_hits_towards(start_m, direction)
     facet = np.where(face >= 0, facets.of_face[face], -1)
     facet[(face >= 0) & (cosine >= 0)] = -1
@@ -350,7 +363,7 @@ def _first_facets(city: CityMap, facets: CityFacets, start_m: np.ndarray, direct
 
 @lru_cache(maxsize=12)  # a map and its variants with random errors
 def candidate_search(city: CityMap, depth: int) -> "CandidateSearch":
-    """Return the cached search of a city: it caches facets that rays from edges visit."""
+    """Return the cached `CandidateSearch` of a city; it keeps what rays from edges have hit."""
     return CandidateSearch(city, depth)
 
 
@@ -387,7 +400,7 @@ class CandidateSearch:
             facet[order], np.arange(len(self.is_ground) + 1)))
 
     def candidates(self, device_m: np.ndarray, rays: int = DEVICE_RAYS) -> Candidates:
-        """Find the sequences of up to `depth` interactions to try from a device (3,) [m].
+        """Find the sequences of reflections and one diffraction that paths from a device may take.
 
         Args:
             device_m: (3,) position [m].
@@ -411,7 +424,10 @@ class CandidateSearch:
         return found
 
     def pairs_of_edges(self, edges: np.ndarray) -> EdgePairsToTry:
-        """Return the second edges to try after first edges (s,), for paths over two edges."""
+        """List second edges to try after each of the first edges (s,), for double diffraction.
+
+        A second edge borders a facet that rays from the first edge hit directly.
+        """
         with self._lock:
             after, first = self._after, self._first_after[edges]
             row, within = expand(self._end_after[edges] - first)
@@ -424,7 +440,7 @@ class CandidateSearch:
                               np.searchsorted(pairs[:, 0], np.arange(len(edges) + 1)))
 
     def _find(self, device_m: np.ndarray, rays: int) -> Candidates:
-        """Find the candidates of a device that is not cached, see `candidates`."""
+        """Compute the result of `candidates` for a device that is not cached."""
         planes = self.surfaces.planes
         direction = _sphere(rays)
         sequences = _shoot(self._city, self.facets, np.broadcast_to(device_m, direction.shape),
@@ -447,10 +463,10 @@ class CandidateSearch:
                           np.concatenate([none[:, 1:], after[row]]))
 
     def _corner_sequences(self, facing: np.ndarray) -> np.ndarray:
-        """Return sequences (n, depth) of two facets of a reentrant corner, the first facing (f,).
+        """List reflections (n, depth) at a facet of `facing` (f,), then at the one it corners with.
 
-        Such corners reflect rays back to the device. From far away, the strips that do so are too
-        narrow to be hit by the rays that are shot.
+        Both facets meet in a reentrant corner, which reflects rays back to the device. From far
+        away, the strips that do so are too narrow to be hit by the rays that are shot.
         """
         corners = self.facets.corners
         found = corners[np.isin(corners[:, 0], facing)] if self._depth > 1 else corners[:0]
@@ -460,7 +476,10 @@ class CandidateSearch:
 
     def _to_edges(self, sequences: FacetSequences, facing: np.ndarray
                   ) -> tuple[np.ndarray, np.ndarray]:
-        """Return facets (n, depth) and edge (n,) of the ways to the edges of all facets hit."""
+        """List partial paths to the edges of facets that rays hit: facets (n, depth), edge (n,).
+
+        Also of direct paths to the edges of the facets in `facing` (f,), which face the device.
+        """
         direct = np.column_stack([np.zeros(len(facing), dtype=int), facing])
         reflected = sequences.next_facets[sequences.next_facets[:, 0] > 0]
         pairs = np.concatenate([direct, reflected])
@@ -470,7 +489,7 @@ class CandidateSearch:
         return sequences.facets[ways[:, 0]], ways[:, 1]
 
     def _look_around(self, edges: np.ndarray) -> None:
-        """Shoot rays from edges (n,), and cache the sequences of facets that they visit."""
+        """Shoot rays from edges (n,) and cache the facet sequences hit, for later devices."""
         after, parents, count = [self._after], [self._parent_after], len(self._after)
         for start in range(0, len(edges), EDGE_CHUNK):
             part = edges[start:start + EDGE_CHUNK]

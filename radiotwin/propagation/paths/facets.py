@@ -68,9 +68,10 @@ class Topology:
 
 
 def _topology(city: CityMap) -> Topology:
-    """Weld the corners of a city, split its triangles' sides and sort the segments.
+    """Weld the corners of a city, and find the segments that its triangles share.
 
-    Slivers, and faces on flat ground, within 5 cm of z = 0, are left out.
+    Sides are split where the corner of another triangle lies on them. Slivers, and faces on flat
+    ground (within 5 cm of z = 0), are left out.
     """
     if not np.isfinite(city.vertices).all():
         raise BadInput("the city has corners that are not finite numbers [m]; repair its meshes")
@@ -93,7 +94,10 @@ def _topology(city: CityMap) -> Topology:
 
 
 def _weld(vertices_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Merge vertices (v, 3) within `WELD_M` to their mean [m]; return it and each vertex's row."""
+    """Merge vertices (v, 3) [m] closer than `WELD_M` into their mean.
+
+    Returns the merged vertices [m], and the row (v,) of each given vertex among them.
+    """
     exact, index = np.unique(vertices_m, axis=0, return_inverse=True)
     pairs = cKDTree(exact).query_pairs(WELD_M, output_type="ndarray")
     graph = coo_matrix((np.ones(len(pairs)), pairs.T.reshape(2, -1)), shape=(len(exact),) * 2)
@@ -113,7 +117,7 @@ def _normals_and_heights(triangle_m: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _split(vertices_m: np.ndarray, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Split sides (s, 2) at corners that lie on them; return pieces (p, 2) and their sides (p,)."""
+    """Split sides (s, 2) at corners on them; return pieces (p, 2) and the side (p,) of each."""
     tree = cKDTree(vertices_m)
     start, end = vertices_m[sides[:, 0]], vertices_m[sides[:, 1]]
     length_m = np.linalg.norm(end - start, axis=1)
@@ -141,9 +145,13 @@ def _split(vertices_m: np.ndarray, sides: np.ndarray) -> tuple[np.ndarray, np.nd
 
 def _rows_of_sides(pieces: np.ndarray, side_of_piece: np.ndarray, side_of_row: np.ndarray,
                    side_count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return corners (s, 2) and triangle (s,) of the pieces of all triangles' sides.
+    """Return a row for each piece of each triangle's sides: corners (s, 2) and triangle (s,).
 
-    `pieces` (p, 2) are of distinct sides, `side_of_row` (3 t,) is the distinct side of each side.
+    Args:
+        pieces: (p, 2) corners of the pieces of distinct sides, side after side.
+        side_of_piece: (p,) distinct side of each piece.
+        side_of_row: (3 t,) distinct side of the three sides of each triangle.
+        side_count: number of distinct sides.
     """
     count = np.bincount(side_of_piece, minlength=side_count)
     first = np.cumsum(count) - count
@@ -152,7 +160,7 @@ def _rows_of_sides(pieces: np.ndarray, side_of_piece: np.ndarray, side_of_row: n
 
 
 def expand(count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Repeat each row i `count[i]` times; return the row and the number of each repetition.
+    """Repeat each index i `count[i]` times; return the indices, and 0, 1, … within each repetition.
 
     >>> [array.tolist() for array in expand(np.array([2, 0, 1]))]
     [[0, 0, 2], [0, 1, 0]]
@@ -204,7 +212,11 @@ def extract_facets(city: CityMap) -> CityFacets:
 
 
 def _facets(city: CityMap, topology: Topology) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return `planes` (f, 19) and `triangle_uv_m` (t, 6) of `Surfaces`, and each face's facet."""
+    """Merge triangles to plane facets; return them as arrays of `Surfaces`.
+
+    Returns:
+        `planes` (f, 19), `triangle_uv_m` (t, 6), and the facet of each face of the city; -1: none.
+    """
     material = city.material[topology.source]
     if city.terrain is not None:
         material = np.where(city.terrain[topology.source], GROUND_MATERIAL, material)
@@ -228,7 +240,7 @@ def _facets(city: CityMap, topology: Topology) -> tuple[np.ndarray, np.ndarray, 
 
 
 def _coplanar_groups(topology: Topology, material: np.ndarray) -> np.ndarray:
-    """Label coplanar neighbours of the same material (t,); return the facet (t,) of triangles."""
+    """Return the facet (t,) of each triangle: connected, coplanar, and of one material (t,)."""
     size = np.diff(topology.group)
     pairs = [np.empty((0, 2), dtype=int)]
     for i in range(MAX_TRIANGLES_AT_SEGMENT):
@@ -300,7 +312,12 @@ def _frames(corners_m: np.ndarray, outward: np.ndarray, first: np.ndarray) -> np
 
 def _edges(planes: np.ndarray, of_face: np.ndarray, topology: Topology
            ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return `Surfaces.edges` (e, 19), their ends (e, 2, 3) [m] and facets (e, 2), which ascend."""
+    """Find the convex edges between facets of one material, at which rays are diffracted.
+
+    Returns:
+        `Surfaces.edges` (e, 19), both ends of each (e, 2, 3) [m], and its two facets (e, 2),
+        ascending.
+    """
     if not len(planes):
         return np.empty((0, 19)), np.empty((0, 2, 3)), np.empty((0, 2), dtype=int)
     normal, material = planes[:, NORMAL:NORMAL + 3], planes[:, MATERIAL]
@@ -332,7 +349,10 @@ def _tangent(direction: np.ndarray, normal: np.ndarray, other_normal: np.ndarray
 
 
 def _join(ends_m: np.ndarray, pair: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Join touching pieces (p, 2, 3) [m] between the same facets (p, 2); return ends and facets."""
+    """Join touching pieces of edge (p, 2, 3) [m] if both lie between the same two facets (p, 2).
+
+    Returns ends (e, 2, 3) [m] and facets (e, 2) of the joined edges.
+    """
     order = np.lexsort((pair[:, 1], pair[:, 0]))
     ends_m, pair = ends_m[order], pair[order]
     is_new = np.append(True, (pair[1:] != pair[:-1]).any(axis=1))[:len(pair)]
@@ -343,9 +363,9 @@ def _join(ends_m: np.ndarray, pair: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 @njit(cache=True)
 def _joined(ends_m: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Join pieces (p, 2, 3) [m] that touch within groups of collinear ones, which begin at `first`.
+    """Join collinear pieces (p, 2, 3) [m] that touch, within groups that begin at rows `first`.
 
-    Returns ends (e, 2, 3) [m] of the joined pieces, and a piece (e,) of each one's group.
+    Returns ends (e, 2, 3) [m] of the joined pieces, and the first row (e,) of the group of each.
     """
     out_m, row = np.empty_like(ends_m), np.empty(len(ends_m), dtype=np.int64)
     count = 0
@@ -373,7 +393,7 @@ def _joined(ends_m: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _wedges(topology: Topology, min_rad: float, max_rad: float) -> np.ndarray:
-    """Return open sectors with angles in a range, (w, 3): row of `segments`, and two triangles."""
+    """Find the open sectors with an angle in a range: segment row and two triangles, (w, 3)."""
     return _open_sectors(topology.vertices_m, topology.triangles, topology.normal,
                          topology.segments, topology.owner, topology.group, min_rad, max_rad)
 
@@ -382,7 +402,12 @@ def _wedges(topology: Topology, min_rad: float, max_rad: float) -> np.ndarray:
 def _open_sectors(vertices_m: np.ndarray, triangles: np.ndarray, normal: np.ndarray,
                   segments: np.ndarray, owner: np.ndarray, group: np.ndarray, min_rad: float,
                   max_rad: float) -> np.ndarray:
-    """Find the open sectors of `_wedges` by sorting the triangles at each segment by angle."""
+    """Find where the open space between two triangles at one segment has an angle in a range.
+
+    Triangles at each segment are sorted by angle around it. Returns (w, 3): first row of the
+    segment, and the triangles at both sides of the open space. Arguments are attributes of
+    `Topology`.
+    """
     found = []
     for g in range(len(group) - 1):
         a, n = group[g], group[g + 1] - group[g]

@@ -176,7 +176,7 @@ def find_paths(surfaces: Surfaces, candidates: Candidates, device_m: np.ndarray,
 
 @njit(cache=True, error_model="numpy")
 def _same_start(candidates: Candidates, row: int, other: int) -> bool:
-    """Return True if two candidates have the same edge and the same facets before it."""
+    """Return True if two candidates have the same edge and the same facets before the edge."""
     same = candidates.edge[row] == candidates.edge[other]
     for k in range(candidates.before.shape[1]):
         same = same and candidates.before[row, k] == candidates.before[other, k]
@@ -195,7 +195,7 @@ def _same_facets(facets: np.ndarray, row: int, other: int) -> int:
 @njit(cache=True, error_model="numpy")
 def source_images(planes: np.ndarray, facets: np.ndarray, device_m: np.ndarray, image: np.ndarray
                   ) -> bool:
-    """Mirror the device in facets one after another; False if an image is behind the next facet.
+    """Mirror the device in facets in turn; return False if an image is behind the next facet.
 
     Writes the device and its images into `image` (n + 1, 3) [m].
     """
@@ -211,7 +211,7 @@ def source_images(planes: np.ndarray, facets: np.ndarray, device_m: np.ndarray, 
 @njit(cache=True, error_model="numpy")
 def reflections_back(planes: np.ndarray, uv_m: np.ndarray, facets: np.ndarray, x: float, y: float,
                      z: float, image: np.ndarray, points_m: np.ndarray) -> bool:
-    """Find the reflection points between the device and x, y, z, the receiver or edge point [m].
+    """Find the reflection points of a path from x, y, z (receiver or edge) back to the device [m].
 
     Writes them into `points_m[1:]`; returns False if there is no such path.
     """
@@ -229,10 +229,11 @@ def _from_edge(planes: np.ndarray, uv_m: np.ndarray, edges: np.ndarray, edge: in
                facets: np.ndarray, first: int, along_m: float, across_m: float, x: float, y: float,
                z: float, mirror: np.ndarray, points_m: np.ndarray
                ) -> tuple[bool, float, float, float]:
-    """Find the diffraction point on an edge and the reflection points from there to x, y, z [m].
+    """Find the points of a path from its diffraction at an edge to the receiver x, y, z [m].
 
-    Writes them into `points_m[first:]`. `along_m` and `across_m` are the coordinates of the
-    device's image around the edge.
+    Writes the diffraction point and the reflection points after it into `points_m[first:]`.
+    `along_m` and `across_m` are the position of the device's image along the edge and its distance
+    from it.
 
     Returns:
         False if there is no such path, and the point on the edge [m].
@@ -264,7 +265,7 @@ def _from_edge(planes: np.ndarray, uv_m: np.ndarray, edges: np.ndarray, edge: in
 @njit(cache=True, error_model="numpy")
 def _meet(planes: np.ndarray, uv_m: np.ndarray, facet: int, x: float, y: float, z: float,
           image_x: float, image_y: float, image_z: float) -> tuple[bool, float, float, float]:
-    """Intersect the line from a point to an image [m] with a facet; False if it misses."""
+    """Return where the line from a point to an image [m] crosses a facet; False if it misses."""
     before_m = height(planes, facet, x, y, z)
     behind_m = -height(planes, facet, image_x, image_y, image_z)
     if before_m < ON_PLANE_M or behind_m < ON_PLANE_M:
@@ -333,7 +334,10 @@ def clear_paths(city: CityMap, surfaces: Surfaces, candidates: Candidates, buffe
 @njit(cache=True, nogil=True, error_model="numpy")
 def _move_off_surfaces(surfaces: Surfaces, candidates: Candidates, buffer: PathBuffer,
                        skin_m: float, points_m: np.ndarray) -> None:
-    """Write the points of paths (k, paths, 3) [m], moved by `skin_m` off their surfaces."""
+    """Copy the points of paths to `points_m` (k, paths, 3) [m], moved off their surfaces.
+
+    Points of interaction move `skin_m` outwards, both ends stay.
+    """
     planes, edges = surfaces.planes, surfaces.edges
     for path in range(points_m.shape[1]):
         row, last = buffer.candidate[path], buffer.count[path] - 1

@@ -162,7 +162,7 @@ def _fresnel_tail(a: float) -> complex:
 def wedge_coefficients(phi: float, phi_in: float, sine_edge: float, distance_m: float,
                        wave_number: float, n: float, face_0: tuple[complex, complex],
                        face_n: tuple[complex, complex]) -> tuple[complex, complex]:
-    """Return the diffraction coefficients of a wedge [2, eq. 25-28, 3].
+    """Return the UTD diffraction coefficients of a wedge with lossy faces [2, eq. 25-28; 3].
 
     Args:
         phi: angle of the diffracted ray from face 0, across the edge [rad], 0 to n π.
@@ -191,9 +191,10 @@ def wedge_coefficients(phi: float, phi_in: float, sine_edge: float, distance_m: 
 
 @njit(cache=True)
 def face_sines(phi: float, phi_in: float, sine_edge: float, n: float) -> tuple[float, float]:
-    """Return the sines of the angles at which faces 0 and n reflect, see the head of this module.
+    """Return the sines of the grazing angles at which the faces 0 and n of a wedge reflect.
 
-    The arguments are those of `wedge_coefficients`.
+    At each face it is the smaller angle of incident and diffracted ray, which is reciprocal.
+    Arguments are those of `wedge_coefficients`.
     """
     return (sine_edge * abs(np.sin(min(phi, phi_in))),
             sine_edge * abs(np.sin(n * np.pi - max(phi, phi_in))))
@@ -201,7 +202,7 @@ def face_sines(phi: float, phi_in: float, sine_edge: float, n: float) -> tuple[f
 
 @njit(cache=True)
 def _cotangent_term(beta: float, x: float, n: float, sign: int) -> complex:
-    """Return cot((π + sign β) / 2n) F(x a(β)), finite at the shadow boundary [2, eq. 26-29, 33]."""
+    """Return a term of UTD: cot((π + sign β) / 2n) F(x a(β)), finite at the boundary [2]."""
     turns = np.rint((beta + sign * np.pi) / (2.0 * np.pi * n))
     half = 0.5 * (2.0 * np.pi * n * turns - beta)
     a = 2.0 * np.cos(half) ** 2
@@ -269,7 +270,7 @@ def around_edge(edges: np.ndarray, edge: int, x: float, y: float, z: float
 def diffract(edges: np.ndarray, edge: int, direction_in: np.ndarray, direction: np.ndarray,
              before_m: float, after_m: float, wave_number: float, slabs: Slabs, field: np.ndarray
              ) -> None:
-    """Diffract the field of a ray at an edge in place [2, eq. 9-13], without the spreading factor.
+    """Replace a ray's field by the one that an edge diffracts (UTD), without spreading loss.
 
     Args:
         edges: of `Surfaces`.

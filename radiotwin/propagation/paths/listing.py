@@ -255,7 +255,10 @@ def _reasons(scene: Scene, device: int, points_m: np.ndarray) -> np.ndarray:
 
 def _follow(scene: Scene, index: list[int], points_m: np.ndarray, usable: np.ndarray
             ) -> Iterator[Rays]:
-    """Yield the paths of a chunk of links, with antenna gains and rows of all links, in order."""
+    """Yield the paths from the devices `index` to their usable points, link after link.
+
+    Amplitudes include antenna gains; receivers count over all points of all devices.
+    """
     count = 0
     with progress("following paths", total=int(usable.sum())) as advance:
         for row, device in enumerate(index):
@@ -388,9 +391,9 @@ def rms_spread(values: np.ndarray, power: np.ndarray, link: np.ndarray, links: i
 
 def angular_spread_deg(angle_rad: np.ndarray, power: np.ndarray, link: np.ndarray, links: int
                        ) -> np.ndarray:
-    """Return the circular spread (links,) of angles (p,) [rad] [deg] (TR 38.901, Annex A.1).
+    """Return the circular spread [deg] of path angles (p,) [rad], by link (TR 38.901, A.1).
 
-    The other arguments are those of `rms_spread`; NaN without a path.
+    The other arguments are those of `rms_spread`. Result (links,); NaN without a path.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         resultant = np.abs(sums(power * np.exp(1j * angle_rad), link, links)) \

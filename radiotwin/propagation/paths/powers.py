@@ -67,7 +67,7 @@ class PathDirections(NamedTuple):
         return cls(*(np.concatenate(arrays)[order] for arrays in zip(*parts, strict=True)))
 
     def of_links(self, rows: np.ndarray) -> "PathDirections":
-        """Select the paths of links `rows` (r,); `link` then counts from 0 in their order."""
+        """Select the paths of links `rows` (r,) and number the links anew, 0 to r - 1."""
         first, end = (np.searchsorted(self.link, rows, side) for side in ("left", "right"))
         link, within = expand(end - first)
         path = first[link] + within
@@ -215,9 +215,11 @@ def path_powers(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, fre
 
 def _strongest_candidates(candidates: Candidates, found: Sequence[tuple[np.ndarray, ...]],
                           total: np.ndarray, over_seen_edge: np.ndarray) -> Candidates:
-    """Select candidates with a path above `WEAK_SHARE` of a link, and one for each edge seen.
+    """Select the candidates to try again from positions close by.
 
-    `found` has candidate, link and power (p,) of paths; `total` (n,) is the power of each link.
+    These are all with a path above `WEAK_SHARE` of its link's power, and one for each edge that the
+    device sees. `found` has candidate, link and power (p,) of paths; `total` (n,) is a link's
+    power.
     """
     candidate, link, power = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
     keep = over_seen_edge & (candidates.after[:, :1] < 0).all(axis=1)
@@ -263,7 +265,10 @@ def clear_paths_gains(city: CityMap, search: CandidateSearch, candidates: Candid
 
 def _directions(link: np.ndarray, power: np.ndarray, departure_m: np.ndarray,
                 arrival_m: np.ndarray) -> PathDirections:
-    """Return paths (p,) with unit vectors from the first and last legs (p, 3) [m]."""
+    """Return paths (p,) with unit vectors along the first and the last legs (p, 3) [m].
+
+    The last leg points from the receiver.
+    """
     departure, arrival = (
         (leg_m / np.maximum(np.linalg.norm(leg_m, axis=1, keepdims=True), 1e-9)).astype(np.float32)
         for leg_m in (departure_m, arrival_m))
@@ -271,7 +276,7 @@ def _directions(link: np.ndarray, power: np.ndarray, departure_m: np.ndarray,
 
 
 def _strongest(paths: PathDirections, links: int) -> PathDirections:
-    """Drop the weakest paths, which together carry less than `NEGLECTED` of a link's power."""
+    """Keep the strongest paths; drop the weakest up to `NEGLECTED` of a link's power in sum."""
     total = np.bincount(paths.link, paths.power, links)
     share = paths.power / np.maximum(total, 1e-300)[paths.link]
     order = np.lexsort((share, paths.link))

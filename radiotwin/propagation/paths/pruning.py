@@ -48,7 +48,7 @@ def spheres_around(receiver_m: np.ndarray) -> np.ndarray:
 @njit(cache=True, error_model="numpy")
 def lit_part(planes: np.ndarray, edges: np.ndarray, edge: int, before: np.ndarray, image: np.ndarray
              ) -> tuple[float, float]:
-    """Return the part of an edge that the device can light by reflections at facets before it.
+    """Return the part of an edge that the device's ray may hit after reflection at given facets.
 
     A point at t metres along the edge is in front of a facet, and its line to the image passes
     within a side of the facet's rectangle, if expressions that are linear in t are positive. They
@@ -100,10 +100,10 @@ def lit_part(planes: np.ndarray, edges: np.ndarray, edge: int, before: np.ndarra
 
 @njit(cache=True, error_model="numpy")
 def open_window(edges: np.ndarray, edge: int, lit_m: np.ndarray, window: np.ndarray) -> None:
-    """Write the window (4,) of all rays that the lit part (2,) [m] of an edge diffracts.
+    """Write the window (4,) of all rays that leave the lit part (2,) [m] of an edge.
 
-    A window is start and end along the edge [m], and least and greatest angle around it from face
-    0 [rad].
+    A window bounds the position along the edge [m], from and to, and the angle around the edge from
+    face 0 [rad], from and to. `narrow` reduces it.
     """
     window[0], window[1] = lit_m[0], lit_m[1]
     window[2], window[3] = -ROUNDING_RAD, edges[edge, EXTERIOR] + ROUNDING_RAD
@@ -114,12 +114,12 @@ def narrow(planes: np.ndarray, edges: np.ndarray, edge: int, after: np.ndarray, 
            source_m: np.ndarray, window: np.ndarray) -> bool:
     """Narrow a window of diffracted rays to those that pass through facet `after[k]`.
 
-    A ray to a point at q along the edge and r from its line leaves the edge at t, where
-    (q - s) d = (t - s) (d + r), with the source at s along the edge and d from its line. So t is
-    above a bound if (q - s) d > (bound - s) (d + r). That holds for all points of a facet if it
-    holds at the corners of its rectangle: r is convex; where convexity does not help, a linear
-    lower bound of r is used. Facets are mirrored so that rays to them stay straight; the angle
-    around the edge is not changed by that.
+    Positions along the edge: q of a point at distance r from the edge's line, s of the source at
+    distance d. The ray leaves the edge at t, where (q - s) d = (t - s) (d + r). So t is above a
+    bound if (q - s) d > (bound - s) (d + r). That holds for all points of a facet if it holds at
+    the corners of its rectangle: r is convex; where convexity does not help, a linear lower bound
+    of r is used. Facets are mirrored so that rays to them stay straight; the angle around the edge
+    is not changed by that.
 
     Args:
         planes: `Surfaces.planes`.
@@ -201,7 +201,10 @@ def _coordinate(point_m: np.ndarray, origin_m: np.ndarray, axis: np.ndarray) -> 
 @njit(cache=True, error_model="numpy")
 def _positive(at_start: float, at_end: float, length_m: float, low_m: float, high_m: float
               ) -> tuple[float, float]:
-    """Clip an interval of an edge [m] to where a function linear along the edge is positive."""
+    """Clip an interval along an edge [m] to where a function that is linear along it is positive.
+
+    `at_start` and `at_end` are its values at both ends of the edge; the interval 0, 0 is empty.
+    """
     if at_start < 0.0 and at_end < 0.0:
         return 0.0, 0.0
     if at_start < 0.0:

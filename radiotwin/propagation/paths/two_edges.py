@@ -81,7 +81,11 @@ def paths_over_two_edges(city: CityMap, surfaces: Surfaces, to_try: EdgePairsToT
 @njit(cache=True, nogil=True, error_model="numpy")
 def _possible(edges: np.ndarray, to_try: EdgePairsToTry, device_m: np.ndarray,
               receiver_m: np.ndarray) -> np.ndarray:
-    """Return (t, 3) receiver, first and second edge that Keller's cones do not rule out."""
+    """List the paths over two edges that the cones of diffracted rays do not rule out.
+
+    A cone of Keller's at the first edge must meet the second, and the other way round. Returns (t,
+    3): receiver, first and second edge.
+    """
     n, seen = len(receiver_m), len(to_try.edge)
     end_m = np.empty((len(edges), 2, 3))
     for k in range(len(edges)):
@@ -113,9 +117,9 @@ def _possible(edges: np.ndarray, to_try: EdgePairsToTry, device_m: np.ndarray,
 
 @njit(cache=True, error_model="numpy")
 def _cone_meets(edges: np.ndarray, edge: int, from_m: np.ndarray, end_m: np.ndarray) -> bool:
-    """Return False if no ray from a point (3,) over an edge meets a segment (2, 3) [m].
+    """Return False if no ray from a point (3,), diffracted by an edge, meets a segment (2, 3) [m].
 
-    Rays leave the edge where (q - s) d = (t - s) (d + r), see `pruning.narrow`. True may be wrong.
+    With the positions and distances of `pruning.narrow`. True may be wrong.
     """
     _, s, d = around_edge(edges, edge, from_m[0], from_m[1], from_m[2])
     low_m, high_m, most_m = np.inf, -np.inf, 0.0
@@ -132,7 +136,12 @@ def _cone_meets(edges: np.ndarray, edge: int, from_m: np.ndarray, end_m: np.ndar
 @njit(cache=True, error_model="numpy")
 def _solve(edges: np.ndarray, tried: np.ndarray, device_m: np.ndarray, receiver_m: np.ndarray
            ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the shortest paths (t, 4, 3) [m] over pairs of edges, and the rows that have one."""
+    """Find the shortest path over each pair of edges in `tried` (t, 3), from device to receiver.
+
+    Returns:
+        (t, 4, 3) device, points on both edges, receiver [m]; and the rows with a path along the
+        edges and outside both wedges. Other rows are not written.
+    """
     points_m, possible = np.empty((len(tried), 4, 3)), np.empty(len(tried), dtype=np.int64)
     count = 0
     for i in range(len(tried)):
@@ -220,13 +229,13 @@ def wave_at_edge(near_m: float, between_m: float, far_m: float, sine2: float
         near_m: length of the leg from this edge to the nearer end of the path [m].
         between_m: length of the leg between the edges [m].
         far_m: length of the leg from the other edge to its end of the path [m].
-        sine2: squared sine of the angle between the two planes that the ray between the edges
-            spans with either edge.
+        sine2: squared sine of the angle between the two planes that the ray between the edges spans
+            with either edge.
 
     Returns:
-        Distance in this edge's transition function, over sin² of the angle between ray and edge [m]
-        (Kouyoumjian and Pathak, eq. 33), and the length s' [m] for which s s' / (s + s') with
-        s = `near_m` is that distance.
+        Distance parameter of this edge's transition function, divided by sin² of the angle between
+        ray and edge [m] (Kouyoumjian and Pathak, eq. 33), and the length s' [m] for which s s' / (s
+        + s') with s = `near_m` is that distance.
     """
     curvature = (1.0 - sine2) / (between_m + far_m) + sine2 / between_m
     distance_m = near_m * (1.0 + near_m * curvature) * between_m * (between_m + far_m) \
