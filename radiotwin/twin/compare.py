@@ -49,7 +49,7 @@ class Comparison:
     predictions: pd.DataFrame
 
     def tables(self) -> list[tuple[str, dict[str, str], list[list]]]:
-        """Return the tables to print: (title, headings with alignment, rows), scores first."""
+        """Return the tables to print: (title, heading -> alignment, rows); scores first."""
         tables: list[tuple[str, dict[str, str], list[list]]] = []
         estimated = self.scores[self.scores["positions"] == "estimated"]
         for against, part in estimated.groupby("against", sort=False):
@@ -100,7 +100,7 @@ def _short(value: float) -> str:
 
 
 def published_models(frequency_hz: float) -> tuple[str, ...]:
-    """Return the `PUBLISHED_MODELS` that can be used at a frequency [Hz], some with a warning."""
+    """Return the `PUBLISHED_MODELS` for use at a frequency [Hz] in, or near, their range."""
     def holds(name: str) -> bool:
         law = channel_named(name)
         assert issubclass(law, PublishedLaw)
@@ -112,14 +112,13 @@ def published_models(frequency_hz: float) -> tuple[str, ...]:
 
 def split_flights(measurements: Measurements, held_out: int = 1
                   ) -> tuple[Measurements, Measurements]:
-    """Split measurements into training flights and held-out flights, the last ones.
+    """Split measurements into those to train on and those of the last, held-out flights.
 
     Args:
         measurements: measurements of two flights or more.
         held_out: number of held-out flights.
 
-    Returns:
-        training measurements, and held-out measurements.
+
 
     Raises:
         BadInput: no flight would be left to learn from.
@@ -273,7 +272,7 @@ def _moved(twin: Twin, position_m: dict[str, tuple[float, float, float]]) -> Twi
 
 def score_map(name: str, candidate: RadioMap, truth: RadioMap,
               positions: str = "estimated") -> list[dict]:
-    """Score a radio map against a truth map, on the devices that both have.
+    """Score a radio map against a truth map; return rows of `Comparison.scores`.
 
     Args:
         name: name of the map in the rows.
@@ -281,8 +280,7 @@ def score_map(name: str, candidate: RadioMap, truth: RadioMap,
         truth: truth map on the same lattice.
         positions: `estimated` or `true`, in the rows.
 
-    Returns:
-        rows of `Comparison.scores`
+
 
     Raises:
         BadInput: the maps have no device in common, or different lattices.
@@ -330,7 +328,7 @@ def _los(scene: Scene, true_m: dict, links: Measurements) -> np.ndarray:
 
 def _scores(model: str, against: str, positions: str, measured_db: np.ndarray,
             predicted_db: np.ndarray, los: np.ndarray) -> list[dict]:
-    """Return RMSE, mean absolute error and bias of all links, LoS (`los` 1) and NLoS (0)."""
+    """Return RMSE, mean absolute error and bias [dB] of all, LoS (`los` 1) and NLoS (0) links."""
     rows = []
     usable = np.isfinite(measured_db) & np.isfinite(predicted_db)
     for links, mask in zip(CLASSES, (usable, usable & (los == 1), usable & (los == 0))):

@@ -56,10 +56,10 @@ def fit_twin(measurements: Measurements | pd.DataFrame | Path | str, scene: Scen
     Args:
         measurements: links to anchors and unknown devices; of a file or a data frame, too.
         scene: its map and extent, and the receivers' sensitivity; or its folder.
-        model: name of a channel model (`radiotwin.propagation.laws.channel_models`); `paths`
-            follows paths over the 3D map, and `path_kriging` allows for errors of that. `auto` is
-            the one of `selection.CHEAP` with the least held-out error; then `segmented_nn` locates
-            the devices, if torch is installed.
+        model: name of a channel model (`radiotwin.propagation.laws.channel_models`); `paths` traces
+            paths over the 3D map, and `path_kriging` estimates errors of the map, too. `auto` is
+            the simplest of `selection.CHEAP` with about the least held-out error; devices are then
+            located by `segmented_nn`, if torch is installed.
         seed: of the channel's and the search's random numbers.
         start: an earlier twin; the search also starts from its positions.
         allow_indoor: whether unknown devices may be inside buildings.
@@ -142,7 +142,7 @@ def fit_twin(measurements: Measurements | pd.DataFrame | Path | str, scene: Scen
 
 
 def _usable(measurements: Measurements) -> Measurements:
-    """Drop copies of links; raise BadInput if levels are empty or all equal."""
+    """Drop rows that repeat a link exactly; raise BadInput if levels are empty or all equal."""
     refuse_empty_levels(measurements.level_db, measurements.level_column)
     copied = copied_rows(measurements.table)
     if not copied.any():
@@ -174,7 +174,7 @@ def _thinned(measurements: Measurements, seed: int) -> Measurements:
 
 
 def _check_heights(measurements: Measurements) -> None:
-    """Raise BadInput with its row if a height of a receiver or measured device is empty."""
+    """Raise BadInput if a receiver or measured device has no height; the message names the row."""
     empty = np.flatnonzero(measurements.table["receiver_z_m"].isna())
     if len(empty):
         raise BadInput(f"{measurements.files[0]}, row {empty[0] + 2}, column receiver_z_m: the "

@@ -75,14 +75,15 @@ def fit_links(links: Links, scene: Scene, channel: type[ChannelModel], seed: int
 
 
 def anchors_links(links: Links) -> tuple[LinkGeometry, np.ndarray, np.ndarray]:
-    """Return the m links of the anchors, their levels (m,) and limits (m,) as a channel has them.
+    """Return geometry, levels (m,), detection limits (m,) of the anchors' links, for a channel.
 
-    What is declared of the devices is taken off both [dB].
+    Declared powers, cables and antenna gains are subtracted from levels and limits [dB].
     """
     return _known_links(links, _anchors_m(links))
 
 
 def _anchors_m(links: Links) -> np.ndarray:
+    """Return the positions (k, 3) of the devices [m]; NaN for those that are no anchors."""
     is_anchor = np.isin(np.arange(len(links.device_m)), sorted(links.anchors))
     return np.where(is_anchor[:, None], links.device_m, np.nan)
 
@@ -102,11 +103,11 @@ def fit_known(links: Links, channel: type[ChannelModel], seed: int) -> Twin:
 
 
 def reliable_m(devices: list[TwinDevice], max_radius_m: float = np.inf) -> np.ndarray:
-    """Return positions (k, 3) [m] that may be relied on, and NaN for the others.
+    """Return the positions (k, 3) of devices that are located well enough [m], NaN of the others.
 
     Args:
         devices: k devices.
-        max_radius_m: of the circle that holds nine in ten of the guesses [m].
+        max_radius_m: largest 90 % credible radius [m].
     """
     located = np.array([each.located and each.credible_radius_m <= max_radius_m
                         for each in devices])
@@ -115,7 +116,7 @@ def reliable_m(devices: list[TwinDevice], max_radius_m: float = np.inf) -> np.nd
 
 def _fit_channel(links: Links, device_m: np.ndarray, channel: type[ChannelModel],
                  seed: int) -> ChannelModel:
-    """Fit to the links of all devices whose position in `device_m` (k, 3) is known."""
+    """Fit a channel model to the links of all devices with a position in `device_m` (k, 3) [m]."""
     if not links.anchors:
         raise BadInput(NO_ANCHOR)
     geometry, level_db, limit_db = _known_links(links, device_m)
@@ -128,7 +129,10 @@ def _fit_channel(links: Links, device_m: np.ndarray, channel: type[ChannelModel]
 
 def _known_links(links: Links, device_m: np.ndarray
                  ) -> tuple[LinkGeometry, np.ndarray, np.ndarray]:
-    """Return the m links of devices with a position in `device_m` (k, 3), gains and limits."""
+    """Return the m links of devices with a position in `device_m` (k, 3), levels and limits (m,).
+
+    Levels and limits are less the declared powers, cables and antenna gains [dB].
+    """
     known = np.isfinite(device_m[:, :2]).all(axis=1)[links.device]
     receiver_m, device = links.receiver_m[known], links.device[known]
     geometry = link_geometry(device_m, receiver_m, device, links.city, links.frequency_hz)
@@ -138,10 +142,10 @@ def _known_links(links: Links, device_m: np.ndarray
 
 def _published(links: Links, device_m: np.ndarray, scene: Scene,
                law: type[PublishedLaw]) -> PublishedLaw:
-    """Return a law as it was published; warn of the transmit power, where levels are powers.
+    """Return a published law for the links' frequency and map, without fitting it to levels.
 
-    That is the declared one of each device, or else the median over detected links of anchors of
-    what it must be, or the scene's.
+    If levels are received powers and no transmit power is declared, `power_dbm` is the median over
+    detected links of anchors, or else the scene's; a warning says which.
     """
     geometry, level_db, limit_db = _known_links(links, device_m)
     fitted = law().fit(geometry, level_db, limit_db)
@@ -167,6 +171,10 @@ def _published(links: Links, device_m: np.ndarray, scene: Scene,
 def _locate(links: Links, scene: Scene, channel: ChannelModel, law_error: LawError | None,
             unknown: np.ndarray, seed: int, start: Twin | None,
             settings: LocalizeSettings | None) -> list[TwinDevice]:
+    """Locate the devices `unknown` (k,) by a fitted channel, or load the result of an earlier run.
+
+    `start` is an earlier twin, whose positions the search tries as well.
+    """
     start_m = None
     if start is not None:
         before = {device.device: (device.x_m, device.y_m) for device in start.devices}
@@ -191,7 +199,7 @@ def _locate(links: Links, scene: Scene, channel: ChannelModel, law_error: LawErr
 
 def make_twin(links: Links, scene: Scene | None, channel: ChannelModel,
               devices: list[TwinDevice]) -> Twin:
-    """Return a twin that says what it was made of: links in a scene, or without a map."""
+    """Make a twin of a fitted channel; its provenance says of which links, scene and version."""
     provenance: dict[str, Any] = {}
     if scene is not None:
         provenance = {"scene": scene.config.name, "scene_hash": scene.content_hash()}

@@ -129,7 +129,7 @@ def relocation_from(scene: Scene, max_radius_m: float, start: Twin | None = None
 
 
 def best_dof(links: Links, channel: ChannelModel, device_m: np.ndarray) -> float:
-    """Return the degrees of freedom of Student-t errors of greatest likelihood, out of DOFS.
+    """Return those degrees of freedom of Student-t errors in DOFS with the greatest likelihood.
 
     Args:
         links: n links.
@@ -227,9 +227,10 @@ def _with_copies(links: Links) -> Links:
 
 
 def _calibrated(devices: list[TwinDevice], links: Links) -> list[TwinDevice]:
-    """Drop the copies of anchors, and widen all radii by the position errors of the copies.
+    """Drop the copies of anchors, and scale all radii by how far the copies were located from them.
 
-    A normal distribution with 90 % radius r has the mean square error r² / ln 10.
+    The copies were located as if unknown. A normal distribution with 90 % radius r has the mean
+    square error r² / ln 10. The factor is at least 1.
     """
     count = len(links.device_names)
     ratios = [PRIOR_DEVICES]
@@ -243,7 +244,7 @@ def _calibrated(devices: list[TwinDevice], links: Links) -> list[TwinDevice]:
 
 
 def _found(links: Links, devices: list[TwinDevice], shift_m: Shift, seed: int) -> Found:
-    """Estimate wall, height and material errors of the map from devices that are not lost."""
+    """Estimate the map's wall, height and material errors by devices located within LOST_M."""
     known = links.with_located_devices(reliable_m(devices, LOST_M))
     informative = drop_uninformative(*known.gains())
     error, diffuse = estimate_other_errors(*informative, seed)
@@ -251,7 +252,10 @@ def _found(links: Links, devices: list[TwinDevice], shift_m: Shift, seed: int) -
 
 
 def _channel(links: Links, devices: list[TwinDevice], found: Found, seed: int) -> PathKriging:
-    """Fit the channel to located devices; those beyond LOST_M are predicted by kriging only."""
+    """Fit `PathKriging`, with the map errors `found`, to located devices, or load it.
+
+    Devices with a 90 % radius above LOST_M are predicted by kriging only.
+    """
     lost = tuple(np.flatnonzero(~np.isfinite(reliable_m(devices, LOST_M)).all(axis=1)).tolist())
     known = links.with_located_devices(reliable_m(devices))
     data = *known.gains(PathKriging(found).declared_db(known)), seed
@@ -263,10 +267,11 @@ def _channel(links: Links, devices: list[TwinDevice], found: Found, seed: int) -
 def _radius_by_map_m(links: Links, devices: list[TwinDevice], channel: ImagePaths,
                      cities: list[CityMap], bounds: tuple[float, float, float, float]
                      ) -> np.ndarray:
-    """Return the 90 % radius (k,) of position errors that map errors cause [m].
+    """Return the 90 % radius (k,) [m] of the position errors that errors of the map cause.
 
-    It follows from the displacement of estimates between the given map and equally wrong ones. Each
-    axis is assumed to be normal, with a variance from a few maps (F distribution).
+    Devices are located again over `cities`, wrong copies of the map; how far they move gives the
+    variance, equal on both axes and normal (F distribution for few maps). 0 if paths never locate
+    the device.
     """
     squares: list[list[float]] = [[] for _ in devices]
     known = {device.device: [(device.x_m, device.y_m)] for device in devices}
@@ -283,7 +288,7 @@ def _radius_by_map_m(links: Links, devices: list[TwinDevice], channel: ImagePath
 
 
 def _moved_device(device: TwinDevice, shift_m: Shift) -> TwinDevice:
-    """Convert a device's position on the shifted map to the frame of the links."""
+    """Move a device back from the shifted map to the frame of the links."""
     east_m, north_m, _ = shift_m
     mode = device.second_mode
     if mode is not None:

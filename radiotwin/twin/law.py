@@ -67,7 +67,9 @@ def law_parameters(channel: ChannelModel, links: LinkGeometry, level_db: np.ndar
 
 def parameters_of(channel: ChannelModel, refit_db: np.ndarray, sd_db: np.ndarray
                   ) -> list[dict[str, Any]]:
-    """Return the parameters of a channel's law after `close-loop`, without intervals.
+    """Return a channel's log-distance law as `close-loop` refitted it, as rows of `COLUMNS`.
+
+
 
     Args:
         channel: channel before the refit.
@@ -108,7 +110,11 @@ def _values(law: LogDistance | SegmentedLogDistance) -> np.ndarray:
 
 def _rows(law: LogDistance | SegmentedLogDistance, values: np.ndarray, spread: np.ndarray
           ) -> list[dict[str, Any]]:
-    """Return rows of `COLUMNS` from `_values` and half widths of their intervals; NaN: unknown."""
+    """Return rows of `COLUMNS` from `_values` and the half widths `spread` of their intervals.
+
+    NaN, and all of a borrowed line, gives no interval (None). Standard deviations are taken out of
+    the logarithm.
+    """
     borrowed = getattr(law, "borrowed", None)
     names = [(links, parameter, unit) for links in _lines(law)
              for parameter, unit in ((LEVEL, "dB"), (EXPONENT, ""), (SD, "dB"))]

@@ -114,7 +114,7 @@ def locate_devices(measurements: Measurements | pd.DataFrame | Path | str, twin:
 
 
 def _with_receivers_of(links: Links, names: Sequence[str]) -> Links:
-    """Renumber the receivers of links by their place in `names`, which must include all of them."""
+    """Renumber the receivers of links by their index in `names`, which has all of them."""
     place = {name: i for i, name in reversed(list(enumerate(names)))}
     number = np.array([place[name] for name in links.receiver_names])
     tracks = {(int(number[receiver]), flight): track
@@ -124,10 +124,10 @@ def _with_receivers_of(links: Links, names: Sequence[str]) -> Links:
 
 
 def _by_channel(twin: Twin, links: Links) -> FittedModel:
-    """Return the twin's channel, or its law, as a fitted model without effects.
+    """Return a model of the twin's fast law (if it traces paths) or of its trend, without effects.
 
-    Its error scales are the channel's median standard deviations for the twin's devices at the
-    receivers of the links.
+    Its error scales are the median standard deviations that the law states for the twin's devices
+    at the receivers of the links.
     """
     channel = twin.channel.quick if twin.channel.follows_paths else twin.channel.trend
     known = np.isfinite(twin.device_m).all(axis=1)
@@ -145,7 +145,11 @@ def _by_channel(twin: Twin, links: Links) -> FittedModel:
 
 
 def _widening(model: FittedModel, links: Links, found: list[TwinDevice]) -> float:
-    """Return residuals of located devices over those in training; 1 below MIN_WIDENING."""
+    """Return the factor, at least 1, by which radii grow as links fit worse than in training.
+
+    It is the ratio of residuals, in error scales, of located devices (median) and of training
+    devices; 1 if it is below MIN_WIDENING or unknown.
+    """
     if np.isnan(model.typical_misfit) or not found:
         return 1.0
     row = {name: row for row, name in enumerate(links.device_names)}

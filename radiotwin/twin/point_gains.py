@@ -17,7 +17,7 @@ from radiotwin.twin import Twin
 
 def export_ns3(source: Twin | RadioMap, scene: Scene, points_m: np.ndarray, folder: Path | str, *,
                devices: Sequence[str] | None = None) -> int:
-    """Write the path losses between devices and points for ns-3, see `write_ns3`.
+    """Write the path losses between devices and points for ns-3; return the number of pairs.
 
     Args:
         source: twin, or radio map with the points on its lattice.
@@ -26,8 +26,7 @@ def export_ns3(source: Twin | RadioMap, scene: Scene, points_m: np.ndarray, fold
         folder: output folder; other files in it stay.
         devices: names of devices; None: all that have a position.
 
-    Returns:
-        number of pairs.
+
 
     Raises:
         BadInput: an unknown device, points off the lattice of a map, or no gain at all.

@@ -41,11 +41,14 @@ class HeldOut:
     @classmethod
     def of(cls, links: LinkGeometry, flight: np.ndarray, level_db: np.ndarray, limit_db: Limit,
            seed: int, models: tuple[str, ...] = CHEAP) -> HeldOut | None:
-        """Fit each model to the links outside a fold, and compute its errors inside.
+        """Compute the errors of channel models on links of the anchors that their fits left out.
+
+        Each model is fitted once without each fold of flights or, with few flights, of ground
+        blocks.
 
         Args:
-            links: n links of the anchors.
-            flight: (n,) index.
+        links: n links of the anchors.
+            flight: (n,) index of each link's flight.
             level_db: (n,) as of `ChannelModel.fit`.
             limit_db: as of `ChannelModel.fit`.
             seed: of the folds and of the fits.
@@ -91,7 +94,7 @@ class HeldOut:
 
     @classmethod
     def kept(cls, provenance: dict[str, Any]) -> HeldOut | None:
-        """Return the errors in a twin's provenance; None if it has none."""
+        """Restore the held-out errors from a twin's provenance; None: models were not compared."""
         rows = provenance.get(HELD_OUT)
         if not rows:
             return None
@@ -100,17 +103,17 @@ class HeldOut:
 
     @property
     def record(self) -> list[dict[str, Any]]:
-        """Rows for the provenance of a twin."""
+        """Return the errors as rows for the provenance of a twin."""
         return [{"model": name, "rmse_db": rmse_db, "by": self.by, "as_good": name in self.as_good}
                 for name, rmse_db in self.rmse_db.items()]
 
     @property
     def best(self) -> str:
-        """The simplest model that is as good as the one with the least error."""
+        """Return the simplest of the models with about the least error."""
         return self.as_good[0]
 
     def sentence(self, model: str) -> str:
-        """Say how the error of a model compares with that of the others."""
+        """Say in a sentence how the held-out error of a model compares with those of the others."""
         errors = ", ".join(f"{name} {rmse_db:.2f}" for name, rmse_db in self.rmse_db.items())
         text = f"RMSE on anchors' links held out by {self.by} [dB]: {errors}."
         if model not in self.rmse_db:
@@ -131,10 +134,10 @@ def _index_rows(rows: np.ndarray) -> np.ndarray:
 
 
 def standard_error(value: np.ndarray, block: np.ndarray) -> float:
-    """Return the standard error of the mean of n values that are alike within a block.
+    """Return the standard error of the mean of n values that are correlated within blocks.
 
-    Of a ratio of block sums (Cochran 1977, 'Sampling Techniques', chapter 6): the errors of
-    links to one device from receivers close together are alike.
+    From the sums over blocks (Cochran 1977, 'Sampling Techniques', chapter 6): links to one device
+    from receivers close together have similar errors.
 
     Args:
         value: (n,)

@@ -43,7 +43,7 @@ class MapErrors:
 
     @classmethod
     def of(cls, twin: Twin, links: Links, seed: int) -> "MapErrors":
-        """Estimate map errors from the residuals of a twin.
+        """Estimate how prediction errors are correlated in space from the residuals of a twin.
 
         Args:
             twin: fitted twin.
@@ -64,7 +64,7 @@ class MapErrors:
     def of_residuals(cls, device: np.ndarray, receiver_m: np.ndarray, residual_db: np.ndarray,
                      sd_db: np.ndarray, seed: int, field: ResidualField | None = None
                      ) -> "MapErrors":
-        """Estimate map errors from residuals of links.
+        """Estimate the spatial correlation of errors, and the spread of devices' levels.
 
         Args:
             device: (n,) row of each link's device.
@@ -96,12 +96,12 @@ class MapErrors:
 
     @classmethod
     def kept(cls, twin: Twin) -> "MapErrors":
-        """Return the map errors in a twin's provenance; the defaults if there are none."""
+        """Return the `MapErrors` stored in a twin's provenance; the defaults if there are none."""
         return cls(**twin.provenance.get(MAP_ERRORS, {}))
 
 
 def _sampled(device: np.ndarray, usable: np.ndarray, seed: int) -> np.ndarray:
-    """Draw up to MAX_LINKS usable links of each device that has MIN_LINKS; return rows."""
+    """Draw up to MAX_LINKS usable links of each device with at least MIN_LINKS; return rows."""
     rng, rows = np.random.default_rng(seed), [np.empty(0, dtype=np.int64)]
     for number in np.unique(device[usable]):
         device_rows = np.flatnonzero((device == number) & usable)
@@ -119,7 +119,9 @@ def _mean_variance(receiver_m: np.ndarray, precision: np.ndarray, field: Residua
 
 
 def with_shadowing(radio_map: RadioMap, twin: Twin) -> RadioMap:
-    """Add the attributes `shadowing_share` and `shadowing_length_m` to a twin's map.
+    """Add the correlated share and correlation length of errors to the attributes of a map.
+
+    They are `shadowing_share` and `shadowing_length_m` [m]; the share is 0 below one cell.
 
     Args:
         radio_map: `twin.radio_map(scene)`.

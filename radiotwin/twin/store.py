@@ -278,7 +278,7 @@ def _declared_record(declared: Declared) -> tuple[dict[str, Any] | None, dict[st
 
 
 def _declared(content: TwinRecord, arrays: dict[str, np.ndarray]) -> Declared:
-    """Restore declared radios from a record and the arrays of antenna patterns."""
+    """Restore declared radios from a record and the arrays of antenna patterns, after checks."""
     record = content.declared
     if record is None:
         if arrays:
@@ -312,7 +312,7 @@ def _declared(content: TwinRecord, arrays: dict[str, np.ndarray]) -> Declared:
 
 
 def _fitted_record(fitted: FittedModel) -> dict[str, Any]:
-    """Return the content of `FittedRecord`."""
+    """Return a fitted model as the content of `FittedRecord` for JSON, with null for NaN."""
     effects = [effect.record() | {"coefficients": coefficients.tolist()}
                for effect, coefficients in zip(fitted.effects, fitted.coefficients, strict=True)]
     return {"level_coefficients": fitted.level_coefficients.tolist(),
@@ -362,7 +362,7 @@ def _fitted(record: FittedRecord, channel: ChannelModel, devices: list[TwinDevic
 
 
 def _unheard(record: UnheardRecord | None, devices: int) -> Unheard | None:
-    """Restore `Unheard`, after checking its devices."""
+    """Restore `Unheard` (offsets of devices without a reading), after checking device rows."""
     if record is None:
         return None
     if max(record.devices) >= devices:
@@ -372,7 +372,11 @@ def _unheard(record: UnheardRecord | None, devices: int) -> Unheard | None:
 
 def _check_terms(effects: list[Effect], coefficients: list[np.ndarray], devices: list[str],
                  receivers: list[str]) -> None:
-    """Raise ValueError if an effect has a wrong number of coefficients, tried on a few links."""
+    """Raise ValueError if effects do not fit their coefficients, or add non-finite levels.
+
+    Tried on a few made-up links; effects that need a map or trace paths are checked as they
+    predict.
+    """
     n = max(len(devices), len(receivers), 2)
     row, nothing = np.arange(n), np.zeros(n)
     columns = Columns(
@@ -397,7 +401,7 @@ def _check_terms(effects: list[Effect], coefficients: list[np.ndarray], devices:
 
 
 def _check_levels(record: FittedRecord, channel: ChannelModel) -> None:
-    """Raise ValueError unless levels and error scales fit the channel's classes of links."""
+    """Raise ValueError if the numbers of levels and error scales are wrong for the channel."""
     if not isinstance(channel, BUILT_IN):
         return
     allowed = {(2, 1), (4, 2)} if channel.uses_map else {(2, 1)}

@@ -247,7 +247,7 @@ class Twin(Summarised):
 
         Args:
             places: a data frame with the columns below, an array (n, 3) of x, y, z [m], or
-                measurements, without the effects of their receivers; or `Links` with the twin's
+                measurements, all predicted without effects of receivers; or `Links` with the twin's
                 devices and receivers.
             scene: the 3D map; None: the scene in which the twin was fitted or loaded.
             interval: probability that a level is between `low_db` and `high_db`, given the device's
@@ -257,9 +257,9 @@ class Twin(Summarised):
                 every device is predicted at each place.
 
         Returns:
-            for places a data frame with their order and index: `device, x_m, y_m, z_m`,
-            `mean_db`, `sd_db`, `low_db`, `high_db` [dB or dBm], `detection_probability`; NaN for a
-            device without a position. For links a `Prediction`.
+            for places a data frame with their order and index: `device, x_m, y_m, z_m`, `mean_db`,
+            `sd_db`, `low_db`, `high_db` [dB or dBm], `detection_probability`; NaN for a device
+            without a position. For links a `Prediction`.
 
         Raises:
             BadInput: a wrong argument; the message says what to pass.
@@ -307,9 +307,9 @@ class Twin(Summarised):
     def radio_map(self, scene: Scene | Path | str | None = None) -> RadioMap:
         """Predict mean and standard deviation of gains over a scene's lattice as a radio map.
 
-        All devices that have a position, without effects of receivers. The mean is predicted even
-        below sensitivity; the attribute `gain_limit_db` is the limit of detection, estimated from
-        the readings if possible.
+        It holds all devices that have a position, and leaves out effects of receivers. The mean is
+        predicted even below sensitivity; the attribute `gain_limit_db` is the limit of detection,
+        that of the readings if known.
 
         Args:
             scene: the scene; None: that in which the twin was fitted or loaded.
@@ -325,7 +325,7 @@ class Twin(Summarised):
         return RadioMap.collect(self.map_stream(world))
 
     def map_stream(self, scene: Scene) -> MapStream:
-        """Return the map of `radio_map` as a stream, predicted block by block when it is written.
+        """Return the radio map as a stream that is predicted block by block as it is written.
 
         Raises:
             BadInput: the twin was fitted without a 3D map, or in another frame.
@@ -398,15 +398,14 @@ class Twin(Summarised):
 
     def plot(self, ax: Axes | None = None, *, scene: Scene | Path | str | None = None,
              geographic: bool | None = None) -> Axes:
-        """Draw the positions of the devices; circles hold 90 % of the probability.
+        """Draw the devices with circles that hold 90 % of the probability; return the axes.
 
         Args:
             ax: matplotlib axes; None: a new figure.
             scene: scene whose buildings are outlined; None: no buildings.
             geographic: axes in longitude and latitude; None: if the origin is known.
 
-        Returns:
-            The axes.
+
 
         Raises:
             BadInput: longitude and latitude are requested, and the origin is unknown.
@@ -433,6 +432,7 @@ class Twin(Summarised):
 
     @property
     def _summary(self) -> Summary:
+        """Return the lines that the twin prints: channel, effects, devices, level, limit, scene."""
         unknown = [device for device in self.devices if device.role == "unknown"]
         located = sum(device.located for device in unknown)
         limit = "not known" if self.limit_db is None else (
@@ -466,7 +466,7 @@ class Twin(Summarised):
         return cls(**decode_twin(record, channel, source))
 
     def power_dbm(self, scene: Scene) -> np.ndarray:
-        """Return the transmit power (k,) contained in the devices' levels [dBm]; 0 for gains.
+        """Return the transmit power (k,) that each device's levels contain [dBm]; 0 for gains.
 
         Warns:
             Levels are received powers, and neither devices nor the scene declare transmit power.
@@ -512,10 +512,10 @@ class Twin(Summarised):
                            "this one")
 
     def require_map(self, scene: Scene | None) -> None:
-        """Raise BadInput unless the twin was fitted with a map, as given, or without, as now.
+        """Raise BadInput if the twin needs a 3D map that is not given, or cannot use the given one.
 
-        Levels fitted to LoS and NLoS need a map; one level for all links cannot use it. Twin and
-        scene must also have the same frame.
+        A twin fitted with a map has levels for LoS and NLoS, one fitted without has one level for
+        all links. Twin and scene must also have the same frame.
         """
         if scene is not None:
             self.require_frame(scene)
@@ -535,7 +535,10 @@ class Twin(Summarised):
 
 
 def measured_heights(links: Links) -> dict[str, list[float]]:
-    """Return the provenance entry on receivers' heights above ground; empty without a map."""
+    """Return the 10 % and 90 % quantile of receivers' heights above the ground [m].
+
+    As an entry of a twin's provenance; empty without a map.
+    """
     if links.city is None:
         return {}
     sampled_m = links.receiver_m[::max(len(links) // MAX_SAMPLED, 1)]

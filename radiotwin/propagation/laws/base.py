@@ -45,7 +45,7 @@ class ChannelModel(ABC):
     @abstractmethod
     def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
             seed: int) -> Self:
-        """Fit the model to measured links.
+        """Fit the model to measured links, and return the model itself.
 
         Args:
             links: n links.
@@ -55,8 +55,7 @@ class ChannelModel(ABC):
                 left out with a warning.
             seed: random seed; equal data and seed give equal bits.
 
-        Returns:
-            the fitted model itself
+
 
         Raises:
             BadInput: too few links were detected, or none.

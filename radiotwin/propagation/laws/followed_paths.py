@@ -406,10 +406,7 @@ class KnownPaths:
                      np.bincount(link, power_past, n)[rows])
 
     def follow(self, rows: np.ndarray) -> None:
-        """Trace and store the paths of those links `rows` (r,) that were not traced before.
-
-        Paths weaker than WEAKEST times the strongest path of their link are dropped.
-        """
+        """Trace links `rows` (r,) not traced before; store their paths unless they are too weak."""
         geometry, parts = self._geometry, [self._paths] if self._paths else []
         rows = rows[~self._is_followed[rows]]
         if not len(rows):

@@ -147,10 +147,7 @@ class PathKriging(ChannelModel):
 
     def _fit_classes(self, links: LinkGeometry, level_db: np.ndarray, limit_db: np.ndarray,
                      mean_db: np.ndarray, square_db: np.ndarray) -> None:
-        """Set `classes`: level offset and error scale [dB] of NLoS and LoS links.
-
-        If one class has no detected link, it takes the numbers of the other.
-        """
+        """Fit `classes`; if LoS or NLoS has no detected link, it takes the numbers of the other."""
         detected = [bool(np.isfinite(level_db[links.los == los]).any()) for los in (False, True)]
         for los in (0, 1):
             if detected[los]:

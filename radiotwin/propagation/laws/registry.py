@@ -45,13 +45,12 @@ _TRIED_M = np.array([(1.0, 0.0), (30.0, 10.0), (300.0, -50.0), (3e3, 100.0), (1e
 
 
 def register(model: type[ChannelModel]) -> type[ChannelModel]:
-    """Add a channel model to this process; usable as a decorator.
+    """Add a channel model to this process and return its class; usable as a decorator.
 
     Args:
         model: subclass of `ChannelModel` with a new name.
 
-    Returns:
-        the class itself
+
 
     Raises:
         BadInput: not a channel model, or another model has its name.

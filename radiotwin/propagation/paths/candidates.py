@@ -476,9 +476,9 @@ class CandidateSearch:
 
     def _to_edges(self, sequences: FacetSequences, facing: np.ndarray
                   ) -> tuple[np.ndarray, np.ndarray]:
-        """List partial paths to the edges of facets that rays hit: facets (n, depth), edge (n,).
+        """List partial paths, facets (n, depth) and edge (n,), to the edges of all facets hit.
 
-        Also of direct paths to the edges of the facets in `facing` (f,), which face the device.
+        Includes direct paths to the edges of the facets in `facing` (f,), which face the device.
         """
         direct = np.column_stack([np.zeros(len(facing), dtype=int), facing])
         reflected = sequences.next_facets[sequences.next_facets[:, 0] > 0]

@@ -192,8 +192,7 @@ def extract_facets(city: CityMap) -> CityFacets:
 
     Faces and edges on flat ground, z = 0, are left out.
 
-    Args:
-        city: 3D map.
+
 
     Raises:
         BadInput: a corner is not finite.

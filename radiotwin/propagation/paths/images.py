@@ -334,10 +334,7 @@ def clear_paths(city: CityMap, surfaces: Surfaces, candidates: Candidates, buffe
 @njit(cache=True, nogil=True, error_model="numpy")
 def _move_off_surfaces(surfaces: Surfaces, candidates: Candidates, buffer: PathBuffer,
                        skin_m: float, points_m: np.ndarray) -> None:
-    """Copy the points of paths to `points_m` (k, paths, 3) [m], moved off their surfaces.
-
-    Points of interaction move `skin_m` outwards, both ends stay.
-    """
+    """Write the points of paths (k, paths, 3) [m], interactions moved off surfaces by `skin_m`."""
     planes, edges = surfaces.planes, surfaces.edges
     for path in range(points_m.shape[1]):
         row, last = buffer.candidate[path], buffer.count[path] - 1

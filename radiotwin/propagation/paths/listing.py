@@ -255,10 +255,7 @@ def _reasons(scene: Scene, device: int, points_m: np.ndarray) -> np.ndarray:
 
 def _follow(scene: Scene, index: list[int], points_m: np.ndarray, usable: np.ndarray
             ) -> Iterator[Rays]:
-    """Yield the paths from the devices `index` to their usable points, link after link.
-
-    Amplitudes include antenna gains; receivers count over all points of all devices.
-    """
+    """Yield paths of `usable` links with antenna gains; receivers count over all links."""
     count = 0
     with progress("following paths", total=int(usable.sum())) as advance:
         for row, device in enumerate(index):

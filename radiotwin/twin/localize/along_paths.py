@@ -61,11 +61,11 @@ WORKER_BYTES = 2 * 2**30  # memory of a process that searches
 
 def followed_since(known: dict[tuple[float, ...], int], followed: Followed
                    ) -> dict[str, np.ndarray]:
-    """Return the new entries of a cache as arrays for a file, for `add_followed`.
+    """Return path powers that were cached since `known` as arrays for a file, for `add_followed`.
 
     Args:
-        known: number of earlier entries at each position.
-        followed: the cache.
+        known: number of cached links of each device position before.
+        followed: the cache: position -> hash of the receiver -> path power.
     """
     new = {position_m: list(powers.items())[known.get(position_m, 0):]
            for position_m, powers in followed.items() if len(powers) > known.get(position_m, 0)}
@@ -77,7 +77,7 @@ def followed_since(known: dict[tuple[float, ...], int], followed: Followed
 
 
 def add_followed(arrays: dict[str, np.ndarray], followed: Followed) -> None:
-    """Add the arrays of `followed_since` to a cache; raise ValueError if they are damaged."""
+    """Add path powers from `followed_since` to a cache in place; ValueError if damaged."""
     ends = list(zip(arrays["hash"].tolist(), arrays["power"].tolist(), strict=True))
     if arrays["count"].sum() != len(ends):
         raise ValueError("counts do not match the entries")
@@ -153,7 +153,7 @@ class Relocation:
         return found
 
     def _search_ahead(self, searches: list[_Question]) -> None:
-        """Run the searches ahead of time on the executor's workers; `_search` reads the results."""
+        """Run the searches in parallel; `_search` then finds their results in the cache on disk."""
         if not self.executor.is_worth_it or not keeps() or len(searches) < 2:
             return
         inputs: list[tuple] = []
@@ -174,7 +174,7 @@ class Relocation:
 
     def _search(self, search: _Search, device: TwinDevice,
                 before: list[tuple[float, float]]) -> TwinDevice:
-        """Search one device, or load the result of an earlier run; add its paths to the cache."""
+        """Search the position of one device, or load it; add its path powers to the cache."""
         city = search.by_law.links.city
         assert city is not None
         followed = self.powers.setdefault(city, {})
@@ -194,7 +194,11 @@ class Relocation:
         return found
 
     def _rows(self, links: Links, device: int) -> np.ndarray:
-        """Choose about LINKS links of a device, the same receivers in every subset of links."""
+        """Choose about LINKS links of a device, by a hash of the receiver position.
+
+        So every subset of links, such as a fold, uses the same receivers, whose path powers are
+        cached.
+        """
         rows = np.flatnonzero(links.device == device)
         hashes = _hashes(links.receiver_m[rows])
         name = links.device_names[device]
@@ -306,10 +310,10 @@ class _Search:
     strongest: dict[_Place, Candidates] = field(default_factory=dict)
 
     def from_law(self, device: TwinDevice, known: list[tuple[float, float]]) -> TwinDevice:
-        """Move a device to its likeliest position along paths, if that explains its links.
+        """Return a device at its likeliest position by traced paths, or unchanged.
 
-        It keeps its position if the law there explains them as well, or if residuals along paths
-        are much larger than those of other devices.
+        It is unchanged if the log-distance law explains its links as well at its position, or if
+        its residuals by paths are much larger than those of other devices (MAX_MISFIT).
 
         Args:
             device: device as located by the law.
@@ -349,7 +353,7 @@ class _Search:
         return [*distinct_modes(cells_m[order], -np.arange(len(order)), count, CELLS_APART_M)]
 
     def _descend(self, from_m: np.ndarray) -> None:
-        """Descend the negative log-likelihood by paths from a position, over four neighbours."""
+        """Descend from a position to lower negative log-likelihood by paths, in smaller steps."""
         best, (value,) = from_m, self._try([from_m])
         for step_m in STEPS_M:
             better = True
@@ -394,7 +398,7 @@ class _Search:
         return self.by_law.nll(links, self.by_law.fit.model.level_at(links))
 
     def _second_looks(self, positions_m: list[np.ndarray]) -> list[np.ndarray]:
-        """Select the SECOND_LOOKS positions (2,) of greatest coarse likelihood."""
+        """Keep the SECOND_LOOKS positions (2,) that short paths of a few links make likeliest."""
         if len(positions_m) <= SECOND_LOOKS:
             return positions_m
         order = np.argsort(in_threads(self._coarse_nll, positions_m), kind="stable")
@@ -432,27 +436,31 @@ class _Search:
 
     def _paths_nll(self, asked: tuple[_Place, Candidates | None]
                    ) -> tuple[float, Candidates | None]:
-        """Return the negative log-likelihood [nats], and strongest candidates, see `follow`."""
+        """Return the negative log-likelihood by paths [nats] of a position.
+
+        `asked` is the position and the candidates (interactions) to try, or None: all. Also returns
+        the strongest candidates, if all were tried.
+        """
         position_m, candidates = asked
         links = self.by_paths.at(np.array(position_m))
         power, strongest = self.relocation.follow(links, self.by_paths.device, candidates)
         return self.by_paths.nll(links, self._level_db(links, power)), strongest
 
     def _nearby(self, position_m: _Place) -> Candidates | None:
-        """Return the strongest candidates at the nearest fully traced position within `NEAR_M`."""
+        """Return the strongest candidates at the nearest fully traced place within `NEAR_M`, if any."""
         away_m = {place: np.hypot(place[0] - position_m[0], place[1] - position_m[1])
                   for place in self.strongest}
         nearest = min(away_m, key=away_m.__getitem__, default=None)
         return None if nearest is None or away_m[nearest] > NEAR_M else self.strongest[nearest]
 
     def _is_cheap(self, position_m: np.ndarray) -> bool:
-        """Return True if a position (2,) needs no search for candidates: cached, or one is near."""
+        """Return True if a position (2,) is cached, or near a fully traced one."""
         place = float(position_m[0]), float(position_m[1])
         return self._nearby(place) is not None or self.relocation.is_followed(
             self.by_paths.at(position_m), self.by_paths.device)
 
     def _find_strongest(self, position_m: np.ndarray) -> None:
-        """Find the strongest candidates at a position (2,) by tracing all its paths."""
+        """Trace all paths from a position (2,); store its strongest interactions in `strongest`."""
         place, links = (float(position_m[0]), float(position_m[1])), self.by_paths.at(position_m)
         if place not in self.strongest:
             assert links.city is not None
@@ -499,9 +507,9 @@ def _search_alone(searches: list[_Question], number: int) -> Piece:
 
 def _cells(around_m: np.ndarray, reach_m: float,
            bounds: tuple[float, float, float, float]) -> np.ndarray:
-    """Return centres (c, 2) of grid cells within reach of a position and the bounds, whole metres.
+    """Return centres (c, 2) of grid cells within bounds and `reach_m` of a position, whole metres.
 
-    The grid is the same for all positions, unless cells must be wider because of MAX_CELLS.
+    The grid is the same for all positions, unless more than MAX_CELLS make it coarser.
     """
     low, high = np.array(bounds[::2]), np.array(bounds[1::2])
     low, high = np.maximum(around_m - reach_m, low), np.minimum(around_m + reach_m, high)

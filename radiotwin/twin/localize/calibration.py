@@ -51,7 +51,7 @@ class RadiusCalibration:
 
 def calibrate_radii(models: list[FittedModel], held_out: list[Links], area_m: Area,
                     seed: int) -> RadiusCalibration:
-    """Locate anchors from held-out links, and calibrate radii by their position errors.
+    """Calibrate 90 % radii by locating anchors from held-out links as if they were unknown.
 
     Args:
         models: a model for each fold, fitted to the other folds.
@@ -95,7 +95,7 @@ def _enough_links(links: Links) -> np.ndarray:
 
 
 def radius_factor(ratios: np.ndarray) -> float:
-    """Return the factor, at least 1, with which 90 % radii hold 90 % of the true positions.
+    """Return the factor, at least 1, by which 90 % radii must grow to hold 90 % of the devices.
 
     Args:
         ratios: (n,) position error over 90 % radius of located devices.

@@ -95,10 +95,10 @@ class LawError:
     @classmethod
     def learnt(cls, channel: Channel, by_class: bool, links: LinkGeometry,
                level_db: np.ndarray) -> LawError:
-        """Estimate the standard errors of a channel that was fitted to n links.
+        """Estimate how well a channel's level and slope are known from the links it was fitted to.
 
-        Weighted least squares of a line, with the sandwich covariance A^-1 (sum_ij rho_ij x_i x_j')
-        A^-1 for residuals of one device that are correlated between receivers.
+        As in a weighted least-squares line, with the sandwich covariance A^-1 (sum_ij rho_ij x_i
+        x_j') A^-1, since residuals of one device are correlated between receivers.
 
         Args:
             channel: fitted channel.
@@ -138,7 +138,10 @@ def _law_columns(links: LinkGeometry, by_class: bool) -> np.ndarray:
 
 def _score_covariance(residuals: DeviceResiduals, columns: np.ndarray,
                       correlation: np.ndarray) -> np.ndarray:
-    """Return sum_ij rho_ij c_i c_j' (p, p) of columns c (n, p) over all links of a device."""
+    """Return a device's score covariance (p, p), sum_ij rho_ij c_i c_j' of columns (n, p).
+
+    The sum is over all pairs of links; rho is `correlation`, by the distance of the receivers.
+    """
     bins = np.minimum((squareform(pdist(residuals.receiver_m)) / BIN_M).astype(int), N_BINS)
     rho = np.append(correlation, 0.0)[bins]
     np.fill_diagonal(rho, 1.0 / residuals.links_per_row)  # pairs grow with the square of links
@@ -176,9 +179,9 @@ def residual_correlation(devices: list[DeviceResiduals]) -> np.ndarray:
 def design_effect(residuals: DeviceResiduals, correlation: np.ndarray) -> float:
     """Return the design effect, at least 1, by which to divide a device's log-likelihood.
 
-    trace(H^-1 J) / 2 with H = sum_i a_i a_i', J = sum_ij (rho_ij + l_i l_j') a_i a_j' over the
-    slopes a and the errors l of the law: the mean widening of the position's variance. Times the
-    residuals' mean square if that is above 1 (the standard deviation is too small).
+    It is how much correlated errors widen the position's variance: trace(H^-1 J) / 2, where H =
+    sum_i a_i a_i' and J = sum_ij (rho_ij + l_i l_j') a_i a_j' over links, with slopes a of the
+    levels and errors l of the law. It is multiplied by the mean square residual if that is above 1.
 
     Args:
         residuals: residuals of the device.
@@ -268,7 +271,7 @@ class Likelihood:
         return self._with_declared(mean_db, xy_m[None], data.seen, data.device)[0], sd_db[0]
 
     def residuals(self, k: int, xy_m: np.ndarray) -> DeviceResiduals:
-        """Return standardised residuals of a device's merged levels, and their slopes.
+        """Return standardised residuals of a device's levels, repeats merged, and their slopes.
 
         Args:
             k: index in `observations.devices`.
@@ -318,7 +321,7 @@ class Likelihood:
 
     def _score(self, data: DeviceObservations, rows: np.ndarray, mean_db: np.ndarray,
                sd_db: np.ndarray) -> np.ndarray:
-        """Return a device's log-likelihood (p,) from mean and sd (p, c) at receivers `rows`."""
+        """Return a device's log-likelihood (p,), given mean and sd (p, c) at receivers `rows`."""
         total = np.zeros(len(mean_db))
         if len(data.seen):
             columns = _columns(rows, data.seen)

@@ -90,7 +90,7 @@ def merge_repeats(receiver_m: np.ndarray, device: np.ndarray, level_db: np.ndarr
 
 def _merge(device: int, position: np.ndarray, level_db: np.ndarray,
            use_missed: bool) -> DeviceObservations:
-    """Merge one device's levels (n,) [dB] at indices (n,) of receiver positions."""
+    """Average one device's levels (n,) [dB] by receiver position, an index (n,); NaN: missed."""
     detected = ~np.isnan(level_db)
     seen, group, count = np.unique(position[detected], return_inverse=True, return_counts=True)
     level = level_db[detected]
@@ -239,7 +239,7 @@ def tabulate(channel: Channel, receiver_m: np.ndarray, z_m: float,
 
 def link_grid(xy_m: np.ndarray, z_m: float, receiver_m: np.ndarray, los: np.ndarray,
               device: int) -> LinkGeometry:
-    """Pair every position of a device with every receiver, positions slowest.
+    """Pair every position of a device with every receiver: p * c links, positions slowest.
 
     Args:
         xy_m: (p, 2) positions of the device [m].
@@ -248,8 +248,7 @@ def link_grid(xy_m: np.ndarray, z_m: float, receiver_m: np.ndarray, los: np.ndar
         los: (p, c) bool, line of sight.
         device: index of the device.
 
-    Returns:
-        p * c links
+
     """
     p, c = los.shape
     device_m = np.repeat(np.column_stack([xy_m, np.full(p, z_m)]), c, axis=0)

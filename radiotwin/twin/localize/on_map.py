@@ -311,10 +311,10 @@ def localize(receiver_m: np.ndarray, device: np.ndarray, level_db: np.ndarray, c
 
 
 def _set_repeat_share(searches: list[Search], observations: Observations) -> None:
-    """Estimate `Likelihood.repeat_share` by a one-way analysis of variance, and set it.
+    """Set `Likelihood.repeat_share` of all searches: how much repeats at one position vary.
 
-    It is the variance within positions over the channel's variance at the devices' approximate
-    positions.
+    It is their variance over the channel's, at the likeliest cells of a coarse scan, at most 1.
+    Unchanged without repeats.
     """
     repeats = sum(int((data.count - 1).sum()) for data in observations.devices)
     if repeats == 0:
@@ -360,7 +360,7 @@ def _run_swarms(searches: list[Search], scans: list[Scan], start_m: np.ndarray,
 
 def _estimate(data: DeviceObservations, name: str, z_m: float,
               found: tuple[Posterior, Search] | None) -> TwinDevice:
-    """Return a device with position, radius and second mode of its posterior; None: no data."""
+    """Return a device with position, 90 % radius and second mode; `found` None: without data."""
     x_m = y_m = np.nan
     radius_m, other, located = np.inf, None, False
     if found is not None:

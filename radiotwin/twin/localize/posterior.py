@@ -60,9 +60,9 @@ class Posterior:
         """Return position (2,) [m] and weight of each separate mode, heaviest first.
 
         A mode is a connected patch of the scan's grid whose cells have at least MODE_FLOOR of the
-        heaviest cell's mass. Its position is its mean under the likelihood itself: a power widens
-        the posterior of a composite likelihood, but does not move its estimate. If the mean is not
-        allowed, or outside the patch, such as a crescent, it is the patch's most likely point.
+        heaviest cell's mass. Its position is its mean under the plain likelihood, not the power of
+        it that widens `mass`. If a device may not be there, or it is outside the patch (a
+        crescent), it is the patch's most likely point.
 
         Args:
             allowed: function from positions (p, 2) [m] to (p,) bool, a device may be there.

@@ -52,7 +52,7 @@ class PositionPosterior:
     @classmethod
     def of(cls, model: FittedModel, device_links: Links, area_m: Area, power: float
            ) -> PositionPosterior:
-        """Compute the log-likelihood over coarse cells, then over fine ones.
+        """Compute the log-likelihood of a device's position, on coarse cells, then on fine ones.
 
         Args:
             model: fitted model; counts receivers as the links do.
@@ -69,9 +69,9 @@ class PositionPosterior:
                    float(device_links.device_m[device, 2]))
 
     def estimate(self, power: float) -> TwinDevice:
-        """Return the position of least expected distance, and the 90 % radius around it.
+        """Return the device at the position of least expected distance, with a 90 % radius.
 
-        The radius is that of the likelihood raised to `power`, at most 1.
+        The likelihood is raised to `power`, at most 1, for the radius only: lower powers widen it.
         """
         best = int((self.apart_m @ _share(self.log_likelihood)).argmin())
         order = np.argsort(self.apart_m[best])
@@ -84,7 +84,7 @@ class PositionPosterior:
 
 def locate(model: FittedModel, links: Links, area_m: Area,
            on_progress: Callable[[], None] = lambda: None) -> Iterator[TwinDevice]:
-    """Locate each device of the links; only the heights of their device positions are used.
+    """Locate each device of the links; their positions are ignored, except for the heights.
 
     Args:
         model: fitted model; counts receivers as the links do.
@@ -113,7 +113,7 @@ def whole_area(model: FittedModel, links: Links) -> Area:
 
 def position_log_likelihood(model: FittedModel, device_links: Links,
                             positions_m: np.ndarray) -> np.ndarray:
-    """Return the log-likelihood (c,) of one device's links for candidate positions [nats].
+    """Return the log-likelihood (c,) of one device's links, by candidate position [nats].
 
     Args:
         model: fitted model; counts receivers as the links do.
@@ -128,7 +128,7 @@ def position_log_likelihood(model: FittedModel, device_links: Links,
 
 def _log_likelihood_at(model: FittedModel, device_links: Links, positions_m: np.ndarray
                        ) -> np.ndarray:
-    """Compute a chunk of `position_log_likelihood`."""
+    """Compute `position_log_likelihood`, integrated over the device's unknown level."""
     n, cells, sd_db = len(device_links), len(positions_m), model.device_sd_db
     fit = fit_elsewhere(model, device_links, positions_m)
     problem = fit.model.regression()
@@ -163,7 +163,11 @@ def fit_elsewhere(model: FittedModel, device_links: Links, positions_m: np.ndarr
 
 def _finer(log_likelihood: np.ndarray, power: float, coarse_m: np.ndarray,
            width_m: float) -> tuple[np.ndarray, float]:
-    """Split coarse cells that hold nearly all probability; return centres (c, 2), width [m]."""
+    """Split the likeliest coarse cells, which hold the probability HELD, into finer ones.
+
+    The likelihood is raised to `power` before. Returns centres (c, 2) and width of the fine cells
+    [m].
+    """
     share = _share(power * log_likelihood)
     order = np.argsort(-share)
     held = order[:int(np.searchsorted(np.cumsum(share[order]), HELD)) + 1]
@@ -180,7 +184,7 @@ def _share(log_likelihood: np.ndarray) -> np.ndarray:
 
 
 def _grid(area_m: Area) -> tuple[np.ndarray, float]:
-    """Return centres (c, 2) of the coarse cells, and their width [m]."""
+    """Cover an area (west, east, south, north) by COARSE_CELLS cells: centres (c, 2), width [m]."""
     west, east, south, north = area_m
     width_m = max(np.sqrt((east - west) * (north - south) / COARSE_CELLS), 1.0)
     x, y = (np.arange(low + width_m / 2, high + width_m / 2, width_m)

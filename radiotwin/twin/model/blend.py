@@ -38,7 +38,7 @@ MAX_SD_RATIO = 100.0  # largest in a file
 
 
 def far_share(away_m: np.ndarray, half_m: float) -> np.ndarray:
-    """Return the share (n,) of the far weights, d / (d + half).
+    """Return how much weights for places far from measurements count (n,): d / (d + half).
 
     Args:
         away_m: (n,) distance d to the nearest measurement [m]; inf: no measurement.
@@ -48,7 +48,10 @@ def far_share(away_m: np.ndarray, half_m: float) -> np.ndarray:
 
 
 def sd_factor(share: np.ndarray, sd_ratio: tuple[float, float]) -> np.ndarray:
-    """Interpolate the factor (n,) on the error scale between near and far, see `Blend.sd_ratio`.
+    """Return the factor (n,) on error scales, between that near and that far from measurements.
+
+
+
 
     Args:
         share: (n,) share of the far weights, see `far_share`.
@@ -60,7 +63,7 @@ def sd_factor(share: np.ndarray, sd_ratio: tuple[float, float]) -> np.ndarray:
 
 def blended(members_db: np.ndarray, scales_db: np.ndarray, share: np.ndarray,
             weights: np.ndarray, sd_ratio: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Combine the predictions of members to one mean and error scale (n,) [dB].
+    """Combine the predictions of several models to one mean and error scale (n,) [dB].
 
     Args:
         members_db: (n, k) level predicted by each member [dB].
@@ -101,9 +104,10 @@ class Blend:
     boresights_deg: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
 
     def away_m(self, links: Links) -> np.ndarray:
-        """Return the distance (n,) of the moving end to its nearest measured position [m].
+        """Return the distance (n,) [m] of each link's moving end from its nearest measurement.
 
-        Only measurements with the same fixed end count; inf if there are none.
+        The moving end is the receiver or the device, see `receivers_move`. Only measurements with
+        the same other end count; inf: none.
         """
         moving_m, other = moving_ends(links, self.receivers_move)
         away_m = np.full(len(links), np.inf)
@@ -115,14 +119,15 @@ class Blend:
 
     def members_db(self, links: Links, mean_db: np.ndarray, scale_db: np.ndarray, dof: float,
                    rest: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Return level (n, k) and error scale (n, k) of each member, in the order of weights [dB].
+        """Return level (n, k) and error scale (n, k) [dB] of each model, in the order of `weights`.
 
         Args:
             links: n links.
-            mean_db: (n,) level predicted by named effects [dB].
-            scale_db: (n,) error scale of named effects, also used for trees [dB].
+            mean_db: (n,) level by channel and named effects [dB].
+            scale_db: (n,) its error scale, also taken for trees [dB].
             dof: degrees of freedom of the errors.
-            rest: (n,) interpolated residual [error scales], and (n,) remaining share of the scale.
+            rest: (n,) interpolated residual [error scales], and (n,) share of the scale that then
+                remains.
         """
         members = {NAMED: mean_db, REST: mean_db + rest[0] * scale_db}
         scales = dict.fromkeys(self.weights, scale_db) | {REST: rest[1] * scale_db}
@@ -141,7 +146,7 @@ class Blend:
 
     def apply(self, links: Links, mean_db: np.ndarray, scale_db: np.ndarray, dof: float,
               rest: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and error scale (n,) of the weighted members [dB]; arguments of `members_db`.
+        """Return mean and error scale (n,) [dB] of the blend; arguments as in `members_db`.
 
         The limit of detection is ignored.
         """
@@ -151,14 +156,14 @@ class Blend:
 
     def weighted(self, weights: dict[str, tuple[float, float]], half_m: float,
                  sd_ratio: tuple[float, float]) -> Blend:
-        """Set the weights, and drop members without a weight; see the class."""
+        """Return the blend with other weights, without the models that have none; see the class."""
         return replace(self, weights=weights, half_m=half_m, sd_ratio=sd_ratio,
                        forests={name: forest for name, forest in self.forests.items()
                                 if name in weights},
                        laws={name: law for name, law in self.laws.items() if name in weights})
 
     def _declared(self, links: Links) -> Links:
-        """Return links with the antenna azimuths that were declared at the fit."""
+        """Return the links with the antenna azimuths that were declared when trees were fitted."""
         boresight_deg = np.full(len(links.device_names), np.nan)
         boresight_deg[self.boresights_deg[:, 0].astype(int)] = self.boresights_deg[:, 1]
         return links.with_ends(boresight_deg=boresight_deg)

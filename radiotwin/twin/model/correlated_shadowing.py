@@ -56,7 +56,7 @@ def _fitted_field(what: str, field: ResidualField, *points: Any) -> ResidualFiel
 
 
 def written_field(field: ResidualField) -> dict[str, Any]:
-    """Return settings and arrays of a field for `FieldState`; positions to a decimetre."""
+    """Return a field of residuals as settings and lists for JSON; positions to a decimetre."""
     arrays, settings = field.state()
     return {"settings": settings,
             "arrays": {name: array.round(1 if name.startswith("position") else 4).tolist()
@@ -83,7 +83,10 @@ class Relatives:
     @classmethod
     def fit(cls, links: Links, z: np.ndarray, field: ResidualField | None,
             seed: int) -> Relatives | None:
-        """Fit the field of relatives' residuals, and the shares; None if no device has relatives.
+        """Fit how residuals follow those of relatives (on one mast); None: no device has relatives.
+
+
+
 
         Args:
             links: n links with moving receivers.
@@ -119,18 +122,18 @@ class Relatives:
         return cls(field, relative_sd, passed_on)
 
     def mean(self, links: Links) -> np.ndarray:
-        """Predict residuals (n,) of links from relatives [error scales]; 0 without relatives."""
+        """Predict residuals (n,) from those of relatives [error scales]; 0 without relatives."""
         return self._share(links) * self.relative_sd * self.field.mean(
             links.device, links.receiver_m, links.receiver)
 
     def at(self, links: Links) -> tuple[np.ndarray, np.ndarray]:
-        """Return `mean`, and the remaining share (n,) of the error scale."""
+        """Return `mean`, and the share (n,) of the error scale that remains after it, 0 to 1."""
         mean, sd = self.field.predict(links.device, links.receiver_m, links.receiver)
         share = self._share(links)
         return share * self.relative_sd * mean, np.sqrt(1 - share**2 * (1 - sd**2))
 
     def _share(self, links: Links) -> np.ndarray:
-        """Return `passed_on` of each link's device (n,); 0 without relatives."""
+        """Return the share `passed_on` (n,) of relatives' residuals, 0..1; 0 without relatives."""
         share = np.zeros(len(links))
         for device, passed_on in self.passed_on.items():
             share[links.device == device] = passed_on
@@ -144,7 +147,7 @@ class Relatives:
 
     @classmethod
     def of(cls, record: RelativesState) -> Relatives:
-        """Restore the prediction from its `state`; raise ValueError if it is damaged."""
+        """Restore the relatives' prediction from its `state`; raise ValueError if it is damaged."""
         field = record.field
         if len(record.passed_on) != len(field.fields):
             raise ValueError("passed_on is not of the devices")
@@ -153,7 +156,7 @@ class Relatives:
 
 
 def _slope(mean: np.ndarray, z: np.ndarray) -> float:
-    """Regress residuals (n,) on relatives' residuals (n,), with shrinkage; clip to 0..1."""
+    """Regress residuals (n,) on those of relatives (n,), shrunk towards 0, and clip to 0..1."""
     slope = float(mean @ z / (mean @ mean + len(z) * LEAST_SHARED_SD**2))
     return min(max(slope, 0.0), 1.0)
 
@@ -187,7 +190,7 @@ class CorrelatedShadowing:
     @classmethod
     def fit(cls, links: Links, train: np.ndarray, z: np.ndarray, seed: int,
             like: CorrelatedShadowing | None = None) -> CorrelatedShadowing:
-        """Fit the interpolation to residuals of a model, see `Fit.rest`.
+        """Fit the interpolation over space to the residuals of a model's training links.
 
         Args:
             links: n links.
@@ -211,7 +214,11 @@ class CorrelatedShadowing:
         return cls(field, relative_sd, move, like is None or like.certain, relatives)
 
     def at(self, links: Links) -> tuple[np.ndarray, np.ndarray]:
-        """Return interpolated residual (n,) [error scales], remaining share (n,) of the scale."""
+        """Interpolate the residual (n,) at links [error scales], and the error that remains.
+
+        The remaining error is a share (n,) of the error scale, 1 far from measurements or if not
+        `certain`.
+        """
         mean, sd = self.field.predict(*_points(links, self.receivers_move))
         mean = self.relative_sd * mean
         if self.relatives is not None:
@@ -243,9 +250,10 @@ class CorrelatedShadowing:
 
 def _points(links: Links,
             receivers_move: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Return series (n,), position (n, 3) [m] and kind (n,) of links for a `ResidualField`.
+    """Return series, position (n, 3) [m] and kind (n,) of links, as `ResidualField.fit` takes them.
 
-    The kind is the receiver if receivers move, so that each receiver has an error of its own.
+    The series (n,) is the fixed end of the link, the position is that of the moving end. If
+    receivers move, the kind is the receiver, so that each has an error of its own.
     """
     position_m, series = moving_ends(links, receivers_move)
     return series, position_m, links.receiver if receivers_move else None
@@ -259,5 +267,5 @@ def moving_ends(links: Links, receivers_move: bool) -> tuple[np.ndarray, np.ndar
 
 
 def receivers_move(links: Links) -> bool:
-    """Return True if receivers were at least at as many positions as there are devices."""
+    """Return True if receivers were at as many positions as there are devices, or more."""
     return len(np.unique(links.receiver_m[:, :2].round(), axis=0)) >= len(links.device_names)

@@ -51,7 +51,7 @@ def refine(fit: Fit, evaluations: int = EVALUATIONS, descents: int = DESCENTS,
         anywhere: also start at `Variation.starts`.
 
     Returns:
-        the better fit, or the given one.
+        the fit with these parameters if it is better, else the given one.
     """
     model, last = fit.model, fit.effects[-1]
     variation = last.variation()
@@ -96,9 +96,11 @@ def refine(fit: Fit, evaluations: int = EVALUATIONS, descents: int = DESCENTS,
 
 
 def _refine_members(fit: Fit, last: Effect, variation: Variation) -> Fit:
-    """Search the parameters of each member of an effect separately, on the links that it changes.
+    """Search the parameters of an effect for each member separately, on the links it changes.
 
-    Members are, for example, single devices. Only a common level is fitted with them.
+    Members have parameters of their own, for example single devices. The rest of the model stays as
+    it is, except for a common level of these links. Returns the given fit if the new one is not
+    better.
     """
     model, numbers = fit.model, variation.values.copy()
     arriving_db = model.regression().arriving(fit.coefficients)[0] - model.terms[-1].offset_db
@@ -178,10 +180,10 @@ def _better(fit: Fit, last: Effect, variation: Variation, numbers: np.ndarray) -
 
 def add_effect(fit: Fit, effect: Effect, like: Effect | None = None,
                group: np.ndarray | None = None) -> Fit | None:
-    """Add an effect to a fitted model, with the parameters of greatest likelihood.
+    """Add an effect to a fitted model with its likeliest parameters, or load the earlier result.
 
-    On all links, levels are quick, and `along_paths` makes them exact; in a fold they are exact if
-    those of `like` are.
+    The effect takes the channel's quick levels, those of its fast law; `along_paths` replaces them
+    by exact ones, from tracing paths. In a fold, levels are exact if those of `like` are.
 
     Args:
         fit: fit without the effect.
@@ -198,15 +200,15 @@ def add_effect(fit: Fit, effect: Effect, like: Effect | None = None,
 
 
 def along_paths(fit: Fit, without: Fit) -> Fit:
-    """Refine the last effect with exact levels along the channel's paths.
+    """Refine the last effect with exact levels, from tracing paths again, in place of quick ones.
 
     Args:
         fit: result of `add_effect`.
         without: the fit without the last effect.
 
     Returns:
-        the fit with exact levels in its last effect; the given fit if these are not better, or the
-        effect does not use them (`Effect.always_exact`).
+        the fit with exact levels if these are better. Else the given fit, as for an effect that
+        does not use them (`Effect.always_exact`), gains too little, or changes too many links.
     """
     effect, gain_nats = fit.effects[-1], without.objective - fit.objective
     changes_few = np.count_nonzero(fit.model.terms[-1].offset_db) <= MAX_FOLLOWED_LINKS
@@ -263,7 +265,7 @@ def _write_addition(found: Fit | None) -> Piece | None:
 
 
 def _reader(model: Model, effect: Effect) -> Callable[..., Fit | None]:
-    """Return the decoder of `_write_addition` for a model with one more effect."""
+    """Return the function that decodes `_write_addition`: `model` plus one effect, fitted."""
     def read(arrays: dict[str, np.ndarray], content: Any) -> Fit | None:
         if content is None:
             return None
@@ -280,7 +282,10 @@ def _reader(model: Model, effect: Effect) -> Callable[..., Fit | None]:
 
 def _best_addition(fit: Fit, effect: Effect, like: Effect | None,
                    group: np.ndarray | None = None) -> Fit | None:
-    """Compute the result of `add_effect`: fit all kinds of proposals, return the likeliest."""
+    """Compute the result of `add_effect`: fit all proposed parameters, return the likeliest fit.
+
+    The effect proposes several kinds, such as several shapes; the best of each is refined first.
+    """
     view = fit.view if group is None else fit.view.of_group(group)
     proposals = effect.propose(view) if like is None else like.propose_like(view)
     kinds: dict[Any, list[Effect]] = {}
@@ -300,7 +305,10 @@ def _best_addition(fit: Fit, effect: Effect, like: Effect | None,
 
 
 def _best_along_paths(fit: Fit, without: Fit) -> Fit:
-    """Compute the result of `along_paths`: exact levels, then descents while they gain enough."""
+    """Compute the result of `along_paths`: take exact levels, then search parameters with them.
+
+    The search is repeated while each time gains MIN_EXACT_GAIN_NATS.
+    """
     best = with_exact_levels(_over_known_paths(fit))
     if not _is_exact(best) and best.channel.follows_paths:
         best = _exactly_beside(best)
@@ -317,7 +325,11 @@ def _best_along_paths(fit: Fit, without: Fit) -> Fit:
 
 
 def _best_of_a_kind(fit: Fit, proposed: list[Effect], is_fold: bool) -> Fit:
-    """Fit the most promising of proposals that differ in parameters only; refine the best fit."""
+    """Fit the effects `proposed`, which differ in parameters only, and refine the best one.
+
+    Of many gains, only the MAX_PROPOSALS with the best score are fitted. A best fit that gains less
+    than MIN_GAIN_NATS is not refined.
+    """
     tried = [fit.model.with_effects([*fit.effects, effect]) for effect in proposed]
     if proposed[0].stage == "gain" and len(tried) > MAX_PROPOSALS:  # only gains have a score
         tried.sort(key=lambda model: -fit.view.score(model.terms[-1].select(fit.train)))
@@ -335,10 +347,11 @@ def _is_exact(fit: Fit) -> bool:
 
 
 def _exactly_beside(fit: Fit) -> Fit:
-    """Search parameters of the last effect with exact levels, around the optimum of quick levels.
+    """Search the last effect's parameters with exact levels (traced paths), near the quick ones.
 
-    Used if exact levels are worse at that optimum; both optima may differ. Only for few parameters,
-    such as a position, because each evaluation traces paths.
+    For the case that exact levels are worse at the optimum of quick levels. Only for few
+    parameters, since each evaluation traces paths. Returns the given fit if the result is not
+    better.
     """
     last = fit.effects[-1]
     variation, exactly = last.variation(), last.exactly()
@@ -350,10 +363,11 @@ def _exactly_beside(fit: Fit) -> Fit:
 
 
 def _over_known_paths(fit: Fit, is_near: bool = False) -> Fit:
-    """Search parameters of the last effect with nearly exact levels from cached paths.
+    """Search the last effect's parameters without tracing: cached paths give nearly exact levels.
 
-    Evaluations take milliseconds (`missing_obstacle`). Returns the given fit if the effect has no
-    such levels, or they are not better.
+    An evaluation takes milliseconds, for example if an obstacle blocks some of the cached paths.
+    Returns the given fit if the effect has no such levels, or exact ones are not better at the
+    result.
     """
     last = fit.effects[-1]
     exact = last.exactly() if fit.channel.follows_paths else None
@@ -368,10 +382,10 @@ def _over_known_paths(fit: Fit, is_near: bool = False) -> Fit:
 
 
 def _near(fit: Fit, like: Effect) -> Fit:
-    """Fit a fold with exact levels near the parameters that were found on all links.
+    """Fit an effect in a fold with exact levels, near the parameters `like` found on all links.
 
-    Tries each parameter NEAR_SHARE of its step to both sides, and all improvements together. So
-    every fold needs the same exact levels, which are cached.
+    Each parameter is tried NEAR_SHARE of its step to both sides, then all improvements together. As
+    every fold tries the same values, their traced paths are cached.
     """
     def fitted(effect: Effect) -> Fit:
         return fit.with_effects([*fit.effects, effect])
@@ -396,7 +410,7 @@ def _near(fit: Fit, like: Effect) -> Fit:
 
 
 def with_exact_levels(fit: Fit) -> Fit:
-    """Replace quick levels of each effect by exact ones if that raises the likelihood."""
+    """Take exact levels, from tracing paths, in each effect where that raises the likelihood."""
     if not fit.channel.follows_paths:
         return fit
     for number, effect in enumerate(fit.effects):

@@ -159,7 +159,7 @@ class Model:
 
     @cached_property
     def limit_db(self) -> np.ndarray:
-        """Return the limit of detection (n,) with the effects on it [dB]; -inf: unknown."""
+        """Return the limit of detection (n,) [dB], raised by effects that set it; -inf: unknown."""
         limit_db = self.links.limit_db
         for effect in self.effects:
             if isinstance(effect, LimitEffect):
@@ -167,7 +167,7 @@ class Model:
         return limit_db
 
     def fit(self, start: FitResult | None = None) -> Fit:
-        """Fit to the training links; an error scale without a training link is the largest one."""
+        """Fit to the training links; a class of links without any takes the largest error scale."""
         found = censored_regression.fit(self.training, start)
         trained = np.unique(self.training.group)
         scale_db = np.full(self.groups, found.scale_db[trained].max())
@@ -183,7 +183,7 @@ class Model:
 
     @cached_property
     def losses(self) -> Losses:
-        """Return the probabilities of blank and of lowered readings that effects cause."""
+        """Return how likely effects blank or lower each reading, and by how much they lower it."""
         losses = [effect.losses(self.links) for effect in self.effects
                   if isinstance(effect, DetectionEffect)]
         if not losses:
@@ -194,11 +194,11 @@ class Model:
         return Losses(1.0 - read, largest.drop, largest.drop_db)
 
     def _scatter_sd_db(self, rows: np.ndarray | slice) -> np.ndarray | float:
-        """Return the standard deviation (n,) of the effects' random scatter of links [dB]."""
+        """Return the sd (n,) by which effects say that links scatter at random [dB]."""
         return _root_sum_square([term.random_effect_sd_db for term in self.terms], rows)
 
     def _random_effect_sd_db(self, rows: np.ndarray | slice) -> np.ndarray | float:
-        """Return the sd (n,) of scatter and of levels of unheard devices together [dB]."""
+        """Return the sd (n,) of random scatter and of levels of unheard devices together [dB]."""
         unheard = [term.unheard_sd_db for term in self.terms]
         return np.hypot(self._scatter_sd_db(rows), _root_sum_square(unheard, rows))
 
@@ -300,7 +300,7 @@ class Fit(FitResult):
         return np.clip(self.view.residual_db / self.view.scale_db, -MAX_REST_Z, MAX_REST_Z)
 
     def rest(self, seed: int, like: CorrelatedShadowing | None = None) -> CorrelatedShadowing:
-        """Fit correlated shadowing to the residuals of the training links.
+        """Fit `shadowing`, the interpolation of the training links' residuals over space.
 
         Args:
             seed: of random subsets of points.
@@ -317,11 +317,12 @@ class Fit(FitResult):
         return self.model.regression().predict(self)
 
     def reading_parts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Split the readings of all links into mean, error scale and spread of unheard devices.
+        """Split the prediction of all links into mean, error scale, and spread of unheard devices.
 
         Returns:
-            (n,) mean [dB]; (n,) error scale without unheard levels [dB], the unit of interpolated
-            residuals; and (n,) standard deviation of levels of devices that were never heard [dB].
+            (n,) mean [dB]; (n,) error scale without that spread [dB], the unit of interpolated
+            residuals; and (n,) standard deviation of the levels of devices that were never heard
+            [dB].
         """
         reading = self.readings()
         mean_db, total_db = reading.mean_db, reading.scale_db
@@ -340,7 +341,7 @@ def _root_sum_square(sds_db: list[np.ndarray | None], rows: np.ndarray | slice
 
 
 def response(effects: Sequence[tuple[Effect, Any]]) -> Response | None:
-    """Chain the responses of effects to a level; None without effects.
+    """Chain the responses of effects, which change a level by a function of it; None: no effect.
 
     Args:
         effects: effects, each with the inputs (n, …) of its term.
@@ -389,7 +390,7 @@ class Unheard:
 
     @classmethod
     def of(cls, fit: Fit, device_sd_db: float) -> Unheard | None:
-        """Estimate the population from a fit; None if every device has a training link.
+        """Estimate mean and spread of the other devices' offsets; None: all have a training link.
 
         Args:
             fit: fit with effects.
@@ -512,7 +513,7 @@ class FittedModel:
                           links.limit_db, self.dof)
 
     def law_on(self, fit: Fit) -> ReadingLaw:
-        """Return the predictive distribution of the readings of a fit's links.
+        """Return the predictive distribution of a fit's links, with shadowing and blend.
 
         Twins use it for maps, folds for held-out links.
 
@@ -529,11 +530,11 @@ class FittedModel:
                           fit.model.losses)
 
     def members_on(self, fit: Fit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the predictions of all members of the blend, for a fit's n links.
+        """Return the predictions of all models of the blend, for a fit's n links.
 
         Returns:
-            (n, k) level [dB] and (n, k) error scale [dB] of each member, and (n,) standard
-            deviation of the levels of devices that were never heard [dB].
+            (n, k) level [dB] and (n, k) error scale [dB] of each model, and (n,) standard deviation
+            of the levels of devices that were never heard [dB].
         """
         assert self.blend is not None
         mean_db, scale_db, unheard_db = self._by_effects(fit)
@@ -541,7 +542,7 @@ class FittedModel:
                                       self._shadowing_at(fit.links)), unheard_db
 
     def _by_effects(self, fit: Fit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return `Fit.reading_parts`, with the population's offsets for unheard devices."""
+        """Return `Fit.reading_parts`; unheard devices get mean offset and spread of the others."""
         mean_db, scale_db, unheard_db = fit.reading_parts()
         if self.unheard is not None:
             is_unheard = np.isin(fit.links.device, self.unheard.devices)
@@ -551,7 +552,7 @@ class FittedModel:
         return mean_db, scale_db, unheard_db
 
     def _shadowing_at(self, links: Links) -> tuple[np.ndarray, np.ndarray]:
-        """Return interpolated residual (n,) and remaining share (n,) of the error scale."""
+        """Return interpolated residual (n,), and the share (n,) of the error scale that remains."""
         if self.shadowing is None:
             return np.zeros(len(links)), np.ones(len(links))
         return self.shadowing.at(links)

@@ -44,7 +44,7 @@ class Secant:
     sides: tuple[float, float] = (1.0, 1.0)
 
     def moved(self, known: np.ndarray, wanted: np.ndarray) -> Secant:
-        """Return the secant on another subset of m links; links outside it do not change.
+        """Return the derivative for another subset of m links; 0 on links that this secant lacks.
 
         Args:
             known: (m,) bool, the links of this secant.
@@ -80,7 +80,7 @@ def linearise(fit: Fit, known: Mapping[int, list[Secant]] | None = None) -> Line
 
     Args:
         fit: fit with effects.
-        known: known secants, by index of the effect.
+        known: secants computed before, by index of the effect.
     """
     variations = [effect.variation() for effect in fit.effects]
     fit = _as_varied(fit, variations)
@@ -94,7 +94,7 @@ def linearise(fit: Fit, known: Mapping[int, list[Secant]] | None = None) -> Line
 
 
 def estimates(linearised: Linearised) -> list[Estimate]:
-    """Estimate the covariance of each effect's coefficients and parameters (cluster-robust).
+    """Return coefficients, covariances and parameter sds of each effect (cluster-robust).
 
     Clusters of correlated errors are blocks of ground, places, and flights; the largest variance
     over these clusterings counts.
@@ -123,7 +123,11 @@ def estimates(linearised: Linearised) -> list[Estimate]:
 
 
 def _as_varied(fit: Fit, variations: list[Variation | None]) -> Fit:
-    """Fit again with quick levels in effects whose parameters are varied with quick levels."""
+    """Fit again with each effect in the form in which its parameters can be varied.
+
+    That has mostly quick levels, from the channel's fast law, in place of traced paths. Returns the
+    given fit if no effect changes.
+    """
     varied = [effect if variation is None else variation.effect(variation.values)
               for effect, variation in zip(fit.effects, variations, strict=True)]
     effects = [old if old.is_same(new) else new
@@ -135,7 +139,7 @@ def _as_varied(fit: Fit, variations: list[Variation | None]) -> Fit:
 
 def _secants(fit: Fit, number: int, variation: Variation | None,
              design_effect: float) -> list[Secant]:
-    """Compute the secant of each parameter of an effect, about as wide as its uncertainty."""
+    """Compute the derivative by each parameter, over a step about as wide as its uncertainty."""
     if variation is None:
         return []
     found = []
@@ -153,7 +157,7 @@ def _secants(fit: Fit, number: int, variation: Variation | None,
 
 
 def _secant(fit: Fit, number: int, variation: Variation, i: int, step: float) -> Secant:
-    """Compute the secant of parameter `i` of effect `number`, a step to both sides."""
+    """Compute the derivative of readings by parameter `i` of effect `number` from both sides."""
     model = fit.model
     effect, problem = model.effects[number], model.training
     blanking = isinstance(effect, DetectionEffect | LimitEffect)
@@ -195,7 +199,7 @@ def _secant(fit: Fit, number: int, variation: Variation, i: int, step: float) ->
 
 
 def _information(fit: Fit, secant: Secant) -> float:
-    """Return the Fisher information of all links on one parameter, the others being known."""
+    """Return the Fisher information of all links on one parameter, if all others are known."""
     problem = fit.model.training
     curvature, scale_curvature = _curvatures(problem, problem.predict(fit))[2:]
     return float((curvature * secant.mean_db**2 + scale_curvature * secant.log_scale**2
@@ -204,9 +208,9 @@ def _information(fit: Fit, secant: Secant) -> float:
 
 def _curvatures(problem: CensoredRegression, predicted: Linearisation,
                 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the slopes of the log-likelihood in mean and log scale, and the information on both.
+    """Return slopes of the log-likelihood in mean and log error scale, and the information on both.
 
-    (n,) each; the information of a Student-t scale is that of Lange et al. (1989), App. B.
+    (n,) each, of the training links; for a Student-t scale by Lange et al. (1989), App. B.
     """
     slope, curvature, scale_slope = problem.reading_law(
         predicted.mean_db, predicted.scale_db).derivatives(problem.level_db)
@@ -217,7 +221,11 @@ def _curvatures(problem: CensoredRegression, predicted: Linearisation,
 
 
 def _scores(fit: Fit, secants: list[Secant], design_effect: float) -> Scores:
-    """Return the scores of links and the precision of priors, for coefficients, then parameters."""
+    """Return each link's score (derivative of its log-likelihood), its information, and priors.
+
+    Columns are all coefficients, those of the channel first, then the varied parameters
+    (`secants`).
+    """
     problem = fit.model.training
     predicted = problem.predict(fit)
     law = problem.law_columns
