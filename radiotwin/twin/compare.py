@@ -118,8 +118,6 @@ def split_flights(measurements: Measurements, held_out: int = 1
         measurements: measurements of two flights or more.
         held_out: number of held-out flights.
 
-
-
     Raises:
         BadInput: no flight would be left to learn from.
     """
@@ -279,8 +277,6 @@ def score_map(name: str, candidate: RadioMap, truth: RadioMap,
         candidate: map to score.
         truth: truth map on the same lattice.
         positions: `estimated` or `true`, in the rows.
-
-
 
     Raises:
         BadInput: the maps have no device in common, or different lattices.

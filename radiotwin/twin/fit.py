@@ -76,8 +76,8 @@ def fit_twin(measurements: Measurements | pd.DataFrame | Path | str, scene: Scen
 
     Raises:
         BadInput: no anchor, nothing detected, links that no channel can be learnt from, an unknown
-            model, devices that may be indoors with one that follows paths, or an earlier twin in
-            another frame.
+            model, indoor devices with a model that traces paths, or an earlier twin in another
+            frame.
     """
     scene = Scene.of(scene)
     measurements = as_measurements(measurements, scene)
@@ -152,7 +152,7 @@ def _usable(measurements: Measurements) -> Measurements:
 
 
 def _thinned(measurements: Measurements, seed: int) -> Measurements:
-    """Draw MAX_LINKS random links, evenly among devices, if there are more."""
+    """Draw MAX_LINKS random links, evenly among devices, and warn, if there are more."""
     device = measurements.device_index
     if len(device) <= MAX_LINKS:
         return measurements

@@ -131,7 +131,7 @@ def _known_links(links: Links, device_m: np.ndarray
                  ) -> tuple[LinkGeometry, np.ndarray, np.ndarray]:
     """Return the m links of devices with a position in `device_m` (k, 3), levels and limits (m,).
 
-    Levels and limits are less the declared powers, cables and antenna gains [dB].
+    From levels and limits are subtracted the declared powers, cables and antenna gains [dB].
     """
     known = np.isfinite(device_m[:, :2]).all(axis=1)[links.device]
     receiver_m, device = links.receiver_m[known], links.device[known]

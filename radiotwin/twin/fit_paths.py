@@ -112,11 +112,12 @@ def fit_paths(links: Links, scene: Scene, law: Twin, relocation: Relocation) -> 
 
 def relocation_from(scene: Scene, max_radius_m: float, start: Twin | None = None,
                     executor: Executor | None = None) -> Relocation:
-    """Set up a search for devices along paths.
+    """Set up a search for unknown devices by tracing paths.
 
     Args:
         scene: its extent bounds the search.
-        max_radius_m: devices with a larger radius by the law are not searched [m].
+        max_radius_m: devices with a larger 90 % radius by the log-distance law are not searched
+            [m].
         start: an earlier twin; its devices with a small radius are searched only around their
             positions in it and by the law.
         executor: searches for several devices at once; None: one after the other.
@@ -191,7 +192,7 @@ def fit_over_wrong_map(links: Links, scene: Scene, seed: int, start: Twin | None
 
 
 def _shift(links: Links, seed: int) -> Shift:
-    """Estimate the shift of the map from the anchors' links."""
+    """Estimate the shift of the map from the anchors' links; none if no anchor has a position."""
     known = links.with_located_devices(links.device_m)
     if not len(known):
         return NO_SHIFT

@@ -30,7 +30,7 @@ def law_of(channel: ChannelModel) -> LogDistance | SegmentedLogDistance | None:
 
 def law_parameters(channel: ChannelModel, links: LinkGeometry, level_db: np.ndarray,
                    limit_db: Limit, seed: int) -> list[dict[str, Any]]:
-    """Return the parameters of a channel's law with 90 % intervals.
+    """Return the parameters of a channel's log-distance law with 90 % intervals.
 
     The intervals are by a delete-a-group jackknife (Kott 2001, 'The delete-a-group jackknife',
     Journal of Official Statistics 17). All links of a block (`ground_blocks`) are in one group.
@@ -68,8 +68,6 @@ def law_parameters(channel: ChannelModel, links: LinkGeometry, level_db: np.ndar
 def parameters_of(channel: ChannelModel, refit_db: np.ndarray, sd_db: np.ndarray
                   ) -> list[dict[str, Any]]:
     """Return a channel's log-distance law as `close-loop` refitted it, as rows of `COLUMNS`.
-
-
 
     Args:
         channel: channel before the refit.
@@ -112,8 +110,8 @@ def _rows(law: LogDistance | SegmentedLogDistance, values: np.ndarray, spread: n
           ) -> list[dict[str, Any]]:
     """Return rows of `COLUMNS` from `_values` and the half widths `spread` of their intervals.
 
-    NaN, and all of a borrowed line, gives no interval (None). Standard deviations are taken out of
-    the logarithm.
+    Where `spread` is NaN, or a line is borrowed, the interval is None. The standard deviation, a
+    logarithm in `values`, is returned in dB.
     """
     borrowed = getattr(law, "borrowed", None)
     names = [(links, parameter, unit) for links in _lines(law)

@@ -185,7 +185,7 @@ def read_truth(path: Path, origin: Origin | None) -> pd.DataFrame:
 
 
 def position_errors(positions: pd.DataFrame, truth: pd.DataFrame) -> dict[str, float]:
-    """Compare located with true positions.
+    """Compute the errors of located positions, and the share of them within the radius.
 
     Args:
         positions: result of `locate_devices`.

@@ -26,8 +26,6 @@ def export_ns3(source: Twin | RadioMap, scene: Scene, points_m: np.ndarray, fold
         folder: output folder; other files in it stay.
         devices: names of devices; None: all that have a position.
 
-
-
     Raises:
         BadInput: an unknown device, points off the lattice of a map, or no gain at all.
     """

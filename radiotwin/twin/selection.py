@@ -47,7 +47,7 @@ class HeldOut:
         blocks.
 
         Args:
-        links: n links of the anchors.
+            links: n links of the anchors.
             flight: (n,) index of each link's flight.
             level_db: (n,) as of `ChannelModel.fit`.
             limit_db: as of `ChannelModel.fit`.

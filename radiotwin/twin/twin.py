@@ -243,7 +243,7 @@ class Twin(Summarised):
     def predict(self, places: Links | Measurements | pd.DataFrame | np.ndarray | None = None, *,
                 scene: Scene | Path | str | None = None, interval: float = 0.9,
                 **columns: Any) -> Prediction | pd.DataFrame:
-        """Predict levels at places, or of links.
+        """Predict the levels of devices at places, or of given links.
 
         Args:
             places: a data frame with the columns below, an array (n, 3) of x, y, z [m], or
@@ -404,8 +404,6 @@ class Twin(Summarised):
             ax: matplotlib axes; None: a new figure.
             scene: scene whose buildings are outlined; None: no buildings.
             geographic: axes in longitude and latitude; None: if the origin is known.
-
-
 
         Raises:
             BadInput: longitude and latitude are requested, and the origin is unknown.

@@ -55,8 +55,6 @@ class ChannelModel(ABC):
                 left out with a warning.
             seed: random seed; equal data and seed give equal bits.
 
-
-
         Raises:
             BadInput: too few links were detected, or none.
         """

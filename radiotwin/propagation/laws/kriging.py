@@ -277,7 +277,7 @@ class ResidualField:
         return covariance
 
     def _fit_correlation(self, fields: list[_Field], kinds: bool) -> None:
-        """Set the correlation by marginal likelihood (Rasmussen and Williams 2006, eq. 5.8)."""
+        """Fit shares and length by marginal likelihood (Rasmussen and Williams 2006, eq. 5.8)."""
         distances_m = [cdist(field.position_m, field.position_m) for field in fields]
         max_m = max(float(distance_m.max()) for distance_m in distances_m)
         if max_m == 0.0:

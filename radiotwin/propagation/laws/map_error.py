@@ -199,7 +199,7 @@ def estimate_shift(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit, s
 
 
 def _random_rows(known: np.ndarray, count: int, seed: int) -> np.ndarray:
-    """Draw at most `count` of the rows where `known` (n,); none if fewer than MIN_LINKS."""
+    """Draw at most `count` rows where `known` (n,) is True; none if less than MIN_LINKS are."""
     rows = np.flatnonzero(known)
     if len(rows) < MIN_LINKS:
         return rows[:0]
@@ -268,7 +268,7 @@ class MapError:
 
     @property
     def warning(self) -> str:
-        """Return a message about large errors of the map; empty if there are none."""
+        """Return a message about map errors above the WARN_ limits; empty if there are none."""
         east_m, north_m, radius_m = self.shift_m
         reflected_db, diffracted_db = self.offsets_db
         parts = [f"it lies {east_m:+.1f} m east and {north_m:+.1f} m north of where it should "

@@ -81,7 +81,7 @@ class PathKriging(ChannelModel):
     @override
     def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
             seed: int = 0) -> Self:
-        """Fit map errors (unless given), both predictions and their weights."""
+        """Fit traced paths and kriging (map errors, too, unless given), and the weights of both."""
         links, level_db, limit_db = drop_uninformative(links, level_db, limit_db)
         self.seed = seed
         sure = ~np.isin(links.device, self.lost)
@@ -239,7 +239,7 @@ class PathKriging(ChannelModel):
 
 def _mixture(weight: np.ndarray, first: tuple[np.ndarray, np.ndarray],
              second: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and sd (n,) [dB] of a mixture of two normals, given as (mean, sd)."""
+    """Return mean and sd (n,) [dB] of a mixture of normals (mean, sd); `weight` is of `first`."""
     mean_db = weight * first[0] + (1 - weight) * second[0]
     square_db = weight * (first[1]**2 + (first[0] - mean_db)**2) \
         + (1 - weight) * (second[1]**2 + (second[0] - mean_db)**2)

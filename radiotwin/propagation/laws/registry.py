@@ -50,8 +50,6 @@ def register(model: type[ChannelModel]) -> type[ChannelModel]:
     Args:
         model: subclass of `ChannelModel` with a new name.
 
-
-
     Raises:
         BadInput: not a channel model, or another model has its name.
     """

@@ -354,7 +354,7 @@ def _coordinates(links: LinkGeometry) -> np.ndarray:
 
 
 def _folds(links: LinkGeometry, rng: np.random.Generator) -> np.ndarray:
-    """Return the index (n,) of the network that each link judges, and does not train.
+    """Return the index (n,) of the network that each link tests, and does not train.
 
     Links of a block, one device and a square of ground, stay together: their errors are alike, and
     early stopping on single links would overfit.

@@ -400,7 +400,7 @@ class CandidateSearch:
             facet[order], np.arange(len(self.is_ground) + 1)))
 
     def candidates(self, device_m: np.ndarray, rays: int = DEVICE_RAYS) -> Candidates:
-        """Find the sequences of reflections and one diffraction that paths from a device may take.
+        """Find sequences of reflections, and at most one diffraction, that paths may take.
 
         Args:
             device_m: (3,) position [m].
@@ -463,7 +463,7 @@ class CandidateSearch:
                           np.concatenate([none[:, 1:], after[row]]))
 
     def _corner_sequences(self, facing: np.ndarray) -> np.ndarray:
-        """List reflections (n, depth) at a facet of `facing` (f,), then at the one it corners with.
+        """List reflections (n, depth) in corners, at a facet of `facing` (f,) and its neighbour.
 
         Both facets meet in a reentrant corner, which reflects rays back to the device. From far
         away, the strips that do so are too narrow to be hit by the rays that are shot.

@@ -192,8 +192,6 @@ def extract_facets(city: CityMap) -> CityFacets:
 
     Faces and edges on flat ground, z = 0, are left out.
 
-
-
     Raises:
         BadInput: a corner is not finite.
     """

@@ -83,8 +83,8 @@ def _possible(edges: np.ndarray, to_try: EdgePairsToTry, device_m: np.ndarray,
               receiver_m: np.ndarray) -> np.ndarray:
     """List the paths over two edges that the cones of diffracted rays do not rule out.
 
-    A cone of Keller's at the first edge must meet the second, and the other way round. Returns (t,
-    3): receiver, first and second edge.
+    A cone of Keller's at the first edge must meet the second, and the other way round. Returns rows
+    (t, 3) of receiver, first and second edge.
     """
     n, seen = len(receiver_m), len(to_try.edge)
     end_m = np.empty((len(edges), 2, 3))

@@ -344,7 +344,7 @@ class _Search:
                        second_mode=None)
 
     def _likely_cells(self, device: TwinDevice) -> list[np.ndarray]:
-        """Return centres (2,) [m] of the cells around a device that are likeliest by the law."""
+        """Return those cell centres (2,) [m] around a device that the log-distance law favours."""
         start_m = np.array([device.x_m, device.y_m])
         reach_m = max(REACH_RADII * device.credible_radius_m, MIN_REACH_M)
         cells_m = self._free(_cells(start_m, reach_m, self.relocation.bounds))
@@ -368,7 +368,7 @@ class _Search:
                     best, value = around_m[np.argmin(values)], min(values)
 
     def _look_around(self) -> None:
-        """Descend again from better positions on rings around the best one, while there are any."""
+        """Try rings around the best position and descend from a better one, while there is any."""
         better = True
         while better:
             best = min(self.tried, key=self.tried.__getitem__)
@@ -405,7 +405,7 @@ class _Search:
         return [positions_m[place] for place in order[:SECOND_LOOKS]]
 
     def _coarse_nll(self, position_m: np.ndarray) -> float:
-        """Return the negative log-likelihood by short paths of a few links [nats]."""
+        """Return the negative log-likelihood of a position [nats] by short paths of a few links."""
         rows = self.by_paths.rows[::max(len(self.by_paths.rows) // COARSE_LINKS, 1)]
         likelihood = replace(self.by_paths, rows=rows)
         links, device = likelihood.at(position_m), likelihood.device
@@ -447,7 +447,7 @@ class _Search:
         return self.by_paths.nll(links, self._level_db(links, power)), strongest
 
     def _nearby(self, position_m: _Place) -> Candidates | None:
-        """Return the strongest candidates at the nearest fully traced place within `NEAR_M`, if any."""
+        """Return the strongest candidates at the nearest fully traced place, if within `NEAR_M`."""
         away_m = {place: np.hypot(place[0] - position_m[0], place[1] - position_m[1])
                   for place in self.strongest}
         nearest = min(away_m, key=away_m.__getitem__, default=None)
@@ -469,7 +469,7 @@ class _Search:
                 links.frequency_hz, rays=RAYS).strongest
 
     def _view(self, best: _Place) -> ResidualView:
-        """Return the residuals of the device's links at the best position."""
+        """Return the residuals by paths of the device's links, at the best position."""
         likelihood, links = self.by_paths, self.by_paths.at(np.array(best))
         power, _ = self.relocation.follow(links, likelihood.device)
         problem = likelihood.problem(links, self._level_db(links, power))

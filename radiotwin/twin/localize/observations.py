@@ -247,8 +247,6 @@ def link_grid(xy_m: np.ndarray, z_m: float, receiver_m: np.ndarray, los: np.ndar
         receiver_m: (c, 3) positions of the receivers [m].
         los: (p, c) bool, line of sight.
         device: index of the device.
-
-
     """
     p, c = los.shape
     device_m = np.repeat(np.column_stack([xy_m, np.full(p, z_m)]), c, axis=0)

@@ -55,7 +55,7 @@ class PositionPosterior:
         """Compute the log-likelihood of a device's position, on coarse cells, then on fine ones.
 
         Args:
-            model: fitted model; counts receivers as the links do.
+            model: fitted model; its receiver indices are those of the links.
             device_links: links of one device.
             area_m: where the device may be.
             power: power of the likelihood by which fine cells are chosen.
@@ -87,7 +87,7 @@ def locate(model: FittedModel, links: Links, area_m: Area,
     """Locate each device of the links; their positions are ignored, except for the heights.
 
     Args:
-        model: fitted model; counts receivers as the links do.
+        model: fitted model; its receiver indices are those of the links.
         links: links of the devices.
         area_m: where the devices may be.
         on_progress: called after each device.
@@ -116,7 +116,7 @@ def position_log_likelihood(model: FittedModel, device_links: Links,
     """Return the log-likelihood (c,) of one device's links, by candidate position [nats].
 
     Args:
-        model: fitted model; counts receivers as the links do.
+        model: fitted model; its receiver indices are those of the links.
         device_links: links of one device.
         positions_m: (c, 2) candidate positions, at the height of the device in the links [m].
     """
@@ -144,7 +144,7 @@ def fit_elsewhere(model: FittedModel, device_links: Links, positions_m: np.ndarr
     """Apply a model to one device's links, repeated for each candidate position of the device.
 
     Args:
-        model: fitted model; counts receivers as the links do.
+        model: fitted model; its receiver indices are those of the links.
         device_links: n links of one device.
         positions_m: (c, 2) candidate positions, at the height of the device in the links [m].
 

@@ -50,9 +50,6 @@ def far_share(away_m: np.ndarray, half_m: float) -> np.ndarray:
 def sd_factor(share: np.ndarray, sd_ratio: tuple[float, float]) -> np.ndarray:
     """Return the factor (n,) on error scales, between that near and that far from measurements.
 
-
-
-
     Args:
         share: (n,) share of the far weights, see `far_share`.
         sd_ratio: factor near measurements, and far from them.

@@ -85,9 +85,6 @@ class Relatives:
             seed: int) -> Relatives | None:
         """Fit how residuals follow those of relatives (on one mast); None: no device has relatives.
 
-
-
-
         Args:
             links: n links with moving receivers.
             z: (n,) residuals [error scales].

@@ -347,10 +347,10 @@ def _is_exact(fit: Fit) -> bool:
 
 
 def _exactly_beside(fit: Fit) -> Fit:
-    """Search the last effect's parameters with exact levels (traced paths), near the quick ones.
+    """Search the last effect's parameters again, with exact levels, from traced paths.
 
-    For the case that exact levels are worse at the optimum of quick levels. Only for few
-    parameters, since each evaluation traces paths. Returns the given fit if the result is not
+    Starts at the optimum of quick levels, for the case that exact ones are worse there. Only for
+    few parameters, since each evaluation traces paths. Returns the given fit if the result is not
     better.
     """
     last = fit.effects[-1]

@@ -76,7 +76,7 @@ class Model:
     def build(cls, links: Links, channel: ChannelModel, dof: float, *,
               device_m: np.ndarray | None = None, train: np.ndarray | None = None,
               channel_db: np.ndarray | None = None) -> Model:
-        """Build a model without effects.
+        """Build the regression model of a channel on n links, without effects.
 
         Args:
             links: n links.
@@ -140,7 +140,10 @@ class Model:
             group=self.group[rows], terms=tuple(term.select(rows) for term in self.terms))
 
     def regression(self, rows: np.ndarray | slice = slice(None)) -> CensoredRegression:
-        """Build the censored regression on links, given by mask, indices or slice."""
+        """Build the regression of levels on some links; those not detected are censored.
+
+        `rows` is a mask, indices or a slice.
+        """
         links, terms = self.links, self.terms
         n = len(self.channel_db[rows])
         return CensoredRegression(
@@ -505,7 +508,7 @@ class FittedModel:
         return Prediction(law.mean_db, law.sd_db, law.detection_probability, law.reading_db)
 
     def law(self, links: Links) -> ReadingLaw:
-        """Return the predictive distribution of the readings of any links."""
+        """Return the predictive distribution of the readings of any links, with all effects."""
         if not self.is_channel_alone:
             return self.law_on(self.on_links(links))
         mean_db, sd_db = self.channel.predict(links.geometry)
@@ -513,7 +516,7 @@ class FittedModel:
                           links.limit_db, self.dof)
 
     def law_on(self, fit: Fit) -> ReadingLaw:
-        """Return the predictive distribution of a fit's links, with shadowing and blend.
+        """Return the predictive distribution of a fit's links, with interpolated residuals.
 
         Twins use it for maps, folds for held-out links.
 

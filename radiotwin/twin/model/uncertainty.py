@@ -139,7 +139,10 @@ def _as_varied(fit: Fit, variations: list[Variation | None]) -> Fit:
 
 def _secants(fit: Fit, number: int, variation: Variation | None,
              design_effect: float) -> list[Secant]:
-    """Compute the derivative by each parameter, over a step about as wide as its uncertainty."""
+    """Compute the derivative of the readings in each parameter of an effect, by apt steps.
+
+    A step is about as wide as the parameter's uncertainty, which a first step tells.
+    """
     if variation is None:
         return []
     found = []
@@ -157,7 +160,7 @@ def _secants(fit: Fit, number: int, variation: Variation | None,
 
 
 def _secant(fit: Fit, number: int, variation: Variation, i: int, step: float) -> Secant:
-    """Compute the derivative of readings by parameter `i` of effect `number` from both sides."""
+    """Compute the derivative of readings in parameter `i` of an effect, by steps to both sides."""
     model = fit.model
     effect, problem = model.effects[number], model.training
     blanking = isinstance(effect, DetectionEffect | LimitEffect)
