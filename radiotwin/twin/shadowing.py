@@ -111,7 +111,7 @@ def _sampled(device: np.ndarray, usable: np.ndarray, seed: int) -> np.ndarray:
 
 
 def _mean_variance(receiver_m: np.ndarray, precision: np.ndarray, field: ResidualField) -> float:
-    """Return the variance [dB²] of a device's weighted mean residual due to correlated errors."""
+    """Return the variance [dB²] of the precision-weighted mean of correlated residuals."""
     scaled = np.sqrt(precision)
     rho = field.share * np.exp(-squareform(pdist(receiver_m)) / field.length_m)
     np.fill_diagonal(rho, 1.0)

@@ -100,7 +100,7 @@ class ResidualField:
 
     def fit(self, series: np.ndarray, position_m: np.ndarray, residual: np.ndarray, seed: int,
             kind: np.ndarray | None = None) -> Self:
-        """Fit the correlation, store the points, and return the field itself.
+        """Fit the correlation over distance, store the points, and return the field itself.
 
         Args:
             series: (n,) index of each point's series.

@@ -265,7 +265,7 @@ def clear_paths_gains(city: CityMap, search: CandidateSearch, candidates: Candid
 
 def _directions(link: np.ndarray, power: np.ndarray, departure_m: np.ndarray,
                 arrival_m: np.ndarray) -> PathDirections:
-    """Return paths (p,) in the directions of their legs (p, 3) [m] from device and receiver."""
+    """Return paths (p,) with unit vectors of their legs (p, 3) [m] from device and receiver."""
     departure, arrival = (
         (leg_m / np.maximum(np.linalg.norm(leg_m, axis=1, keepdims=True), 1e-9)).astype(np.float32)
         for leg_m in (departure_m, arrival_m))

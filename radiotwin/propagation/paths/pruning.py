@@ -32,7 +32,7 @@ GROUP = 16  # neighbouring receivers that are tested together first
 
 @njit(cache=True, error_model="numpy")
 def spheres_around(receiver_m: np.ndarray) -> np.ndarray:
-    """Return centres and radii (g, 4) [m] of spheres around each `GROUP` of receivers (n, 3)."""
+    """Enclose every `GROUP` consecutive receivers (n, 3) in a sphere: centre, radius (g, 4) [m]."""
     spheres = np.empty((-(-len(receiver_m) // GROUP), 4))
     for group in range(len(spheres)):
         points_m = receiver_m[group * GROUP:(group + 1) * GROUP]

@@ -119,7 +119,8 @@ def _possible(edges: np.ndarray, to_try: EdgePairsToTry, device_m: np.ndarray,
 def _cone_meets(edges: np.ndarray, edge: int, from_m: np.ndarray, end_m: np.ndarray) -> bool:
     """Return False if no ray from a point (3,), diffracted by an edge, meets a segment (2, 3) [m].
 
-    With the positions and distances of `pruning.narrow`. True may be wrong.
+    Positions along the edge (s of the point, q) and distances from it (d, r) are as in
+    `pruning.narrow`. True may be wrong.
     """
     _, s, d = around_edge(edges, edge, from_m[0], from_m[1], from_m[2])
     low_m, high_m, most_m = np.inf, -np.inf, 0.0

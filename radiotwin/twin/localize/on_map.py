@@ -332,7 +332,10 @@ def _set_repeat_share(searches: list[Search], observations: Observations) -> Non
 def _run_swarms(searches: list[Search], scans: list[Scan], start_m: np.ndarray,
                 settings: LocalizeSettings, rng: np.random.Generator, advance: Callable[[int], None]
                 ) -> dict[int, np.ndarray]:
-    """Run the swarms of all devices; return for each device their best positions (s, 2) [m]."""
+    """Run a swarm from each likely position of each device; return their best ones (s, 2) [m].
+
+    Likely are distinct modes of the scan, and the earlier estimate in `start_m` if there is one.
+    """
     search_of = {k: search for search in searches for k in search.likelihood.devices}
     centres, whose = [], []
     for search, scan in zip(searches, scans, strict=True):

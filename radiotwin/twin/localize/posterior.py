@@ -60,9 +60,9 @@ class Posterior:
         """Return position (2,) [m] and weight of each separate mode, heaviest first.
 
         A mode is a connected patch of the scan's grid whose cells have at least MODE_FLOOR of the
-        heaviest cell's mass. Its position is its mean under the plain likelihood, not the power of
-        it that widens `mass`. If a device may not be there, or it is outside the patch (a
-        crescent), it is the patch's most likely point.
+        heaviest cell's mass. Its position is the mean over the patch under the likelihood itself,
+        since the power that widens `mass` must not move it; if that mean is outside the patch (a
+        crescent) or not allowed, it is the patch's likeliest point.
 
         Args:
             allowed: function from positions (p, 2) [m] to (p,) bool, a device may be there.

@@ -153,7 +153,7 @@ class Blend:
 
     def weighted(self, weights: dict[str, tuple[float, float]], half_m: float,
                  sd_ratio: tuple[float, float]) -> Blend:
-        """Return the blend with other weights, without the models that have none; see the class."""
+        """Return the blend with other weights and scales; models that get no weight are dropped."""
         return replace(self, weights=weights, half_m=half_m, sd_ratio=sd_ratio,
                        forests={name: forest for name, forest in self.forests.items()
                                 if name in weights},

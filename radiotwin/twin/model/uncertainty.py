@@ -123,10 +123,10 @@ def estimates(linearised: Linearised) -> list[Estimate]:
 
 
 def _as_varied(fit: Fit, variations: list[Variation | None]) -> Fit:
-    """Fit again with each effect in the form in which its parameters can be varied.
+    """Return the fit with every effect as its `variation` builds it, fitted again if that differs.
 
-    That has mostly quick levels, from the channel's fast law, in place of traced paths. Returns the
-    given fit if no effect changes.
+    A variation mostly takes quick levels, from the channel's fast law, in place of exact ones, from
+    tracing paths.
     """
     varied = [effect if variation is None else variation.effect(variation.values)
               for effect, variation in zip(fit.effects, variations, strict=True)]
