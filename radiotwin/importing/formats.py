@@ -42,10 +42,10 @@ _MIXED = ("levels are RSRP of LTE and NR, RSCP of UMTS, RSSI of GSM: they differ
 
 
 def _read_rtl_power(file: LogFile, settings: Settings) -> tuple[pd.DataFrame, np.ndarray]:
-    """Sum the power of each sweep of rtl_power in the band of the settings, or over all bins.
+    """Sum the power [dB] of each sweep of rtl_power, in the band of the settings or in all bins.
 
-    Bins with their centre in the band count. If bins are wider than the band, it is the bin that
-    contains the middle of the band, and the band is named after its edges.
+    Bins with their centre in the band count. If bins are wider than the band, the bin with the
+    band's middle counts, and the band is named after the edges of that bin.
 
     Returns:
         texts `date, time, band, power_db, bins`, with `power_db` empty if a sweep does not cover
@@ -163,7 +163,7 @@ class Format:
             not self.needs or set(self.needs) <= set(self.mapping(names)))
 
     def mapping(self, header: Iterable[str]) -> dict[str, str]:
-        """Return the entries of `columns` that a header has, with its spelling of the names."""
+        """Return quantity -> column for each quantity of this format that a header has."""
         actual = {_plain(name): name for name in reversed(list(header))}  # the first one counts
         result = {}
         for quantity, entries in self.columns.items():
@@ -184,7 +184,10 @@ def _plain(name: str) -> str:
 
 
 def _matching_column(name: str, actual: Mapping[str, str]) -> str:
-    """Return the column of a plain name, in which `*` is any text; `""` if there is none."""
+    """Return the column of a header for a name in which `*` is any text; `""` if there is none.
+
+    `actual` maps names in a plain form to those of the header; the first column counts.
+    """
     if "*" not in name:
         return actual.get(name, "")
     pattern = re.compile(".*".join(map(re.escape, name.split("*"))))
@@ -192,7 +195,7 @@ def _matching_column(name: str, actual: Mapping[str, str]) -> str:
 
 
 def _node_position_columns(payload: str) -> dict[str, str | tuple[str, ...]]:
-    """Return the mapping of a node's position, for the usual names in decoded payloads."""
+    """Return quantity -> usual column names of a node's position in the fields of a payload."""
     return {quantity: tuple(f"{payload}{each}" for short in (long, *others)
                             for each in ((f"*{short}",) if short == long else
                                          (short, f"*.{short}")))
@@ -234,7 +237,7 @@ DRIVE_TEST = (
 def _lora(name: str, title: str, source: str, payload: str, place: str,
           settings: Mapping[str, Any] = _UNITS, **columns: str | tuple[str, ...]
           ) -> tuple[Format, Format]:
-    """Return the formats of a LoRa network's uplinks, for nodes with and without a position.
+    """Return formats of a LoRa network's uplinks, for nodes that send a position and others.
 
     `payload` and `place` are prefixes of columns: of the decoded payload, and of a gateway's
     position. `columns` are those of `level`, `snr`, `time`, `node` and `gateway`.
@@ -401,7 +404,10 @@ FORMATS: tuple[Format, ...] = (*PHONE, *DRIVE_TEST, *LORA, *SCANNER)
 
 
 def expected(formats: Iterable[Format], columns: Collection[str]) -> Expected:
-    """Return the columns that a file of some formats, or with declared columns, may have."""
+    """Return the column names by which to find the header of a file.
+
+    They are the declared `columns`, and those that each format needs, in lower case.
+    """
     formats = list(formats)
     signatures = [frozenset(name.lower() for name in each.signature) for each in formats]
     return Expected((frozenset(columns), *signatures),

@@ -53,7 +53,7 @@ class _Table:
         self.unread = Counter[str]()
 
     def add(self, record: dict[str, Any], number: int, where: str) -> None:
-        """Add the rows of a record."""
+        """Add the rows of a record, number `number` of its file; BadInput if they are too many."""
         if record.get("type") == "Feature" and "geometry" in record:
             record = _point_record(record, where)
         for row, is_reception in self._rows(record, ""):
@@ -71,7 +71,7 @@ class _Table:
 
     def source(self, where: Callable[[int], str],
                bad: list[tuple[str, int, str]]) -> Source:
-        """Return all rows; records without receptions are left out if others have receptions."""
+        """Return all rows; if some records have lists of receptions, those without are left out."""
         lists = tuple(f"{name}." for name, is_rows in self._is_rows.items() if is_rows)
         others = {row for row in self._without if lists
                   and not any(name.startswith(lists) for name in self.rows[row])}
@@ -94,7 +94,10 @@ class _Table:
                       left_out=tuple(left_out))
 
     def _rows(self, value: dict[str, Any], prefix: str) -> Iterator[tuple[dict[str, str], bool]]:
-        """Yield the rows of an object, each with whether it is an object of a list."""
+        """Yield the rows of a record: one for each object in its lists, or one if it has none.
+
+        The second value tells whether the row is of such an object, as one reception of a message.
+        """
         flat: dict[str, str] = {}
         receptions: list[tuple[str, list[Any]]] = []
         self._flatten(value, prefix, flat, receptions)
@@ -107,7 +110,7 @@ class _Table:
 
     def _flatten(self, value: dict[str, Any], prefix: str, flat: dict[str, str],
                  receptions: list[tuple[str, list[Any]]]) -> None:
-        """Add the nested values of an object to `flat`, and its lists of rows to `receptions`."""
+        """Add nested values to `flat` as `a.b`, and lists of objects to `receptions`, in place."""
         for key, item in value.items():
             name = f"{prefix}{key}"
             if isinstance(item, dict):
@@ -119,7 +122,10 @@ class _Table:
 
     def _add_list(self, name: str, items: list[Any], flat: dict[str, str],
                   receptions: list[tuple[str, list[Any]]]) -> None:
-        """Add a list as rows, as numbered columns, or as unread, see `_flatten`."""
+        """Add a list to `receptions` if of objects, to `flat` if short; else count it as unread.
+
+        Objects become rows if their list is the chosen one, or has a used column.
+        """
         if items and all(isinstance(each, dict) for each in items):
             if name not in self._is_rows:
                 begin = f"{name.lower()}."
@@ -137,7 +143,7 @@ class _Table:
 
 
 def starts_json(line: str) -> bool:
-    """Return whether a first line is JSON, or an object after a word or two (MQTT clients)."""
+    """Return whether a file's first line is JSON, or an object after some words (MQTT clients)."""
     if re.match("\x1e?{|\\[ *({|$)", line):
         return True
     before, brace, _ = line.partition("{")
@@ -180,7 +186,7 @@ def read_json_log(file: LogFile, declared: Collection[str], may_be: Collection[s
 
 def _read(file: LogFile, used: Collection[str], chosen: str | None, crs: str | None,
           bad_rows: BadRows | None) -> Source:
-    """Read the records of a file; the objects of lists with a used column become rows."""
+    """Read the records of a file; objects in lists with a used column become rows of their own."""
     table = _Table(file, used, chosen, crs)
     try:
         if _has_lines(file):
@@ -207,7 +213,7 @@ def _has_lines(file: LogFile) -> bool:
 
 def _add_lines(file: LogFile, table: _Table,
                bad_rows: BadRows | None) -> list[tuple[str, int, str]]:
-    """Add the records of JSON lines; return the bad ones: reason, number, and the first one."""
+    """Add the records of JSON lines to a table; return reason, number and first of bad lines."""
     bad: list[int] = []
     cut: list[tuple[str, int, str]] = []
     with file.open() as content, io.TextIOWrapper(content, "utf-8", newline="") as text:
@@ -243,10 +249,9 @@ def _add_lines(file: LogFile, table: _Table,
 
 def _add_document(file: LogFile, table: _Table,
                   bad_rows: BadRows | None) -> tuple[bool, list[tuple[str, int, str]]]:
-    """Add the records of all documents in a file to a table.
+    """Add the records of all JSON documents in a file to a table.
 
-    Returns:
-        whether they are GeoJSON features; and bad records: reason, number, and the first one.
+    Returned are whether they are GeoJSON features, and reason, number and first one of bad records.
     """
     is_map = False
     bad: list[tuple[str, int, str]] = []
@@ -309,7 +314,7 @@ def _documents(file: LogFile) -> Iterator[Any]:
 
 
 def _records_of_columns(value: dict[str, Any]) -> list[dict[str, Any]] | None:
-    """Convert an object with a list or an object for each column to records; None if it is none.
+    """Convert an object that holds a table by columns to records; None if it is no such object.
 
     pandas writes `{"a": {"0": 1, "1": 2}}`, `{"a": [1, 2]}` and `{"columns": …, "data": …}`.
     """
@@ -343,7 +348,7 @@ def _point_record(feature: dict[str, Any], where: str) -> dict[str, Any]:
 
 
 def _to_degrees(file: LogFile, table: pd.DataFrame, crs: str) -> dict[str, pd.Series]:
-    """Convert coordinates in another reference system to longitude and latitude, as texts."""
+    """Convert coordinates of a reference system to longitude and latitude [deg], as texts."""
     from pyproj import Transformer
     from pyproj.exceptions import CRSError, ProjError
 

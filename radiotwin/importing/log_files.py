@@ -119,7 +119,7 @@ def list_files(paths: Iterable[Path | str],
 
 
 def flight_names(files: list[LogFile]) -> list[str]:
-    """Return a unique name of each file: its stem, else its name, else its path."""
+    """Return a unique name of each file: without its ending, else with it, else its path."""
     stems = [PurePosixPath(re.sub(r"\.gz$", "", file.name, flags=re.IGNORECASE)).stem
              for file in files]
     if len(set(stems)) == len(stems):
@@ -168,7 +168,7 @@ def open_member(archive: zipfile.ZipFile, name: str, source: object) -> Iterator
 
 
 def _check_directory(file: IO[bytes], path: Path) -> None:
-    """Raise BadInput if the list of files is too long, before `ZipFile` reads it."""
+    """Raise BadInput if a zip file's list of files is too long; `ZipFile` would read it all."""
     size = file.seek(0, os.SEEK_END)
     file.seek(max(size - 2**16 - 22, 0))  # the list's end: 22 bytes and a comment
     tail = file.read()

@@ -114,7 +114,7 @@ def to_geographic(positions: pd.DataFrame, crs: str | None) -> pd.DataFrame:
 
 
 def _numbered_names(names: pd.Series, since_s: np.ndarray) -> pd.Series:
-    """Rename repeated names (n,) to `NAME@1`, … in the order of time."""
+    """Rename repeated names (n,) to `NAME@1`, … in the order of `since_s` [s]; NaN is first."""
     order = np.lexsort((np.arange(len(names)), np.nan_to_num(since_s, nan=-np.inf)))
     number = names.iloc[order].groupby(names.iloc[order]).cumcount() + 1
     repeated = names.duplicated(keep=False)
@@ -122,9 +122,10 @@ def _numbered_names(names: pd.Series, since_s: np.ndarray) -> pd.Series:
 
 
 def _names_by_time(source: Source, links: pd.DataFrame, table: pd.DataFrame | None) -> pd.DataFrame:
-    """Rename the device of each link to `NAME@…`, by its position in the table at that time.
+    """Rename devices with several positions over time to `NAME@1`, …, by the time of each link.
 
-    A device without a position at a time keeps its name.
+    The table has a row for each such name, with the times since and until when it holds. Where no
+    row holds, a link keeps the device's name.
     """
     if table is None or SINCE not in table:
         return links
@@ -155,10 +156,10 @@ def _names_by_time(source: Source, links: pd.DataFrame, table: pd.DataFrame | No
 
 def _names_by_place(source: Source, links: pd.DataFrame, device_m: np.ndarray,
                 place_m: float) -> np.ndarray:
-    """Return the device of each link (n,), with several positions of one as `NAME@1`, ….
+    """Return the device of each link (n,); if it has several places, as `NAME@1`, ….
 
-    Positions (n, 3) [m] within `place_m` of the first one are one place; places are numbered as
-    they occur.
+    Positions (n, 3) [m] within `place_m` of the first one at a place belong to it; places are
+    numbered as they occur.
     """
     names = links["device"].to_numpy(dtype=object, copy=True)
     filled_m = np.nan_to_num(device_m)
@@ -255,7 +256,8 @@ def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
                   tally: Tally) -> PositionedLinks:
     """Find the positions of receivers and devices in one local frame.
 
-    Links without a receiver position are counted in the tally and left out.
+    Links without a receiver position, or with an impossible one, are counted in the tally and left
+    out.
 
     Raises:
         BadInput: a table that cannot be used, a position far from the origin, or a moving device.
@@ -307,8 +309,8 @@ def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
 def _placeholder_fixes(receivers: pd.DataFrame, names: pd.Series) -> dict[str, np.ndarray]:
     """Find placeholder positions that a program wrote in place of a missing fix.
 
-    Such a position repeats to the last digit, far from all others of a moving receiver. Returns the
-    rows of the readings at each, by the position as text.
+    Such a position repeats to the last digit, far from the middle of a moving receiver's positions.
+    Returned are position as text -> rows of its readings.
     """
     if "latitude" not in receivers:
         return {}
@@ -335,7 +337,7 @@ def _placeholder_fixes(receivers: pd.DataFrame, names: pd.Series) -> dict[str, n
 
 def _far_notes(source: Source, links: pd.DataFrame, receivers: pd.DataFrame,
                devices: pd.DataFrame, sites: dict[str, SiteTable]) -> list[str]:
-    """Note devices that are far from the receivers, see `far_notes`."""
+    """Note devices that are far from the middle of the receivers; BadInput: see `far_notes`."""
     for axes in (("latitude", "longitude"), ("x", "y")):
         if all(axis in ends for axis in axes for ends in (receivers, devices)):
             break
@@ -384,7 +386,7 @@ def _are_glitches(links: pd.DataFrame, receiver_m: np.ndarray) -> np.ndarray:
     """Find links (n,) with an impossible receiver position, as a mask.
 
     Such a position is far from all others of the receiver, or would need supersonic flight to and
-    from it. If there are many, they are no glitches, and none is marked.
+    from it. If there are many (see `are_few`), they are real positions, and none is marked.
     """
     known = np.flatnonzero(np.isfinite(receiver_m[:, :2]).all(axis=1))
     glitch = np.zeros(len(links), dtype=bool)
@@ -431,7 +433,11 @@ def _check_near(source: Source, links: pd.DataFrame, position_m: np.ndarray, end
 
 def _positions(links: pd.DataFrame, prefix: str, table: pd.DataFrame | None, names: pd.Series,
                crs: str | None) -> pd.DataFrame:
-    """Return columns of `POSITION`: position and height each from the log, else from the table."""
+    """Return positions and heights of links' ends (columns of `POSITION`), NaN: unknown.
+
+    Both are taken from the log (columns that begin with `prefix`), else from `table` by the end's
+    name; a position or a height is never mixed from both.
+    """
     columns = {name: links[prefix + name] for name in POSITION if prefix + name in links}
     positions = to_geographic(pd.DataFrame(columns, index=links.index), crs)
     if table is None:
@@ -453,7 +459,7 @@ def _positions(links: pd.DataFrame, prefix: str, table: pd.DataFrame | None, nam
 
 def _above_ground_m(links: pd.DataFrame, prefix: str, table: pd.DataFrame | None, names: pd.Series,
                     z_m: np.ndarray) -> np.ndarray:
-    """Return heights above the ground (n,) [m] from the log, else from the table.
+    """Return heights above the ground (n,) [m] of links' ends: from the log, else from the table.
 
     NaN if there is none, or if the height above the datum, `z_m` (n,), is known.
     """
@@ -471,7 +477,8 @@ def _device_table(source: Source, links: pd.DataFrame, device_m: np.ndarray,
                   moving_m: float) -> pd.DataFrame:
     """Make the table `devices.csv` of the links' devices; BadInput if a device moves.
 
-    `declared_as` maps names that `_split_by_band` made to the names in the table of devices.
+    A device moves if its positions span more than `moving_m` [m]. `declared_as` maps names that
+    `_split_by_band` made to the names in the table of devices, `table`.
     """
     by_device = pd.DataFrame(device_m, columns=["x_m", "y_m", "z_m"], index=links.index).groupby(
         links["device"].to_numpy(), sort=False)

@@ -72,7 +72,10 @@ class Expected:
 
 
 def _read_sheets(file: LogFile, declared: str | None) -> Iterator[tuple[str, Sheet]]:
-    """Yield the declared sheet, or all sheets but charts; formulas have their saved values."""
+    """Yield name and content of the declared sheet of a workbook, or of each that is no chart.
+
+    Formulas have the values that were saved with them.
+    """
     _check(file)
     openpyxl = optional_package(
         "openpyxl", f"{file}: workbooks need the package openpyxl; `pip install radiotwin[xlsx]`, "
@@ -100,7 +103,11 @@ def _read_sheets(file: LogFile, declared: str | None) -> Iterator[tuple[str, She
 
 def _read_workbook(file: LogFile, settings: Settings, expected: Expected,
                    bad_rows: BadRows | None) -> Source:
-    """Read the sheets with the declared columns, else those with the columns of the first one."""
+    """Read the sheets of a workbook that belong together, as one table.
+
+    They are those with the declared columns, else those with the columns of the first sheet; or the
+    first that `expected.is_wanted` accepts. A note names the others.
+    """
     settings = settings.model_copy(update={"delimiter": ","})
     sources: dict[str, Source] = {}
     failed: dict[str, BadInput] = {}
@@ -138,7 +145,7 @@ def _read_workbook(file: LogFile, settings: Settings, expected: Expected,
 
 
 def _joined(file: LogFile, sources: dict[str, Source], notes: tuple[str, ...]) -> Source:
-    """Join the rows of several sheets."""
+    """Join the rows of several sheets of one workbook with the same columns."""
     starts = np.cumsum([0, *map(len, sources.values())])
     parts = list(sources.items())
 
@@ -178,7 +185,7 @@ def _check(file: LogFile) -> None:
 
 
 def _text(file: LogFile, sheet: Any) -> bytes:
-    """Convert a sheet to comma-separated text."""
+    """Convert a sheet of a workbook to comma-separated text; BadInput if it is too large."""
     sheet.reset_dimensions()  # those in the file may be wrong
     text = io.BytesIO()
     wrapper = io.TextIOWrapper(text, "utf-8", newline="", write_through=True)
@@ -197,7 +204,7 @@ def _text(file: LogFile, sheet: Any) -> bytes:
 
 
 def _shown(value: object) -> str:
-    """Return a cell as text, without a time of midnight and without a point of whole numbers."""
+    """Return a cell of a sheet as text: dates without midnight, whole numbers without a point."""
     if value is None:
         return ""
     if isinstance(value, datetime):

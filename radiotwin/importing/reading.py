@@ -119,7 +119,10 @@ def build_links(source: Source, settings: Settings, tally: Tally, problems: Prob
 
 
 def _from_file_name(source: Source, name: str, spec: str, file_name: str) -> str:
-    """Replace `by file` and `{file date}` in a mapping by a name, number or date in the file name.
+    """Replace `by file` and `{file date}` in a mapping's entry by what the file name says.
+
+    `by file` is the whole name, for a device, receiver or flight, else the number with a unit in
+    it.
 
     Raises:
         BadInput: the file name contains none, or two.
@@ -151,7 +154,10 @@ def _from_file_name(source: Source, name: str, spec: str, file_name: str) -> str
 
 def _shared_columns(source: Source, columns: dict[str, str], settings: Settings,
             problems: Problems) -> pd.DataFrame:
-    """Read the columns that belong to all levels of a row: times, positions, names."""
+    """Read times, positions and names of rows, which belong to all levels in a row.
+
+    Errors are collected in `problems`, so that a message has all; the result is then incomplete.
+    """
     shared = pd.DataFrame(index=source.table.index)
     present = {name for name, spec in columns.items()
                if spec in (BY_DAY, BY_POSITION)
@@ -184,7 +190,11 @@ def _shared_columns(source: Source, columns: dict[str, str], settings: Settings,
 
 def _rows_as_links(source: Source, level: LevelColumn, shared: pd.DataFrame, settings: Settings,
               tally: Tally) -> pd.DataFrame:
-    """Make the links of one column of levels; unusable ones are counted and dropped."""
+    """Make a link of each row's level in one column; unusable ones are counted and dropped.
+
+    Those are levels not measured or impossible, and links without a name, a valid position or a
+    possible height. `shared` are the columns that belong to all columns of levels.
+    """
     links = shared.copy(deep=False)  # columns are added and replaced, never changed in place
     for name, spec in level.own.items():
         if name not in NAMES:
@@ -245,7 +255,7 @@ def _is_length(name: str, settings: Settings) -> bool:
 
 
 def _quantity(source: Source, name: str, spec: str, settings: Settings) -> np.ndarray:
-    """Read a quantity in the project's units, (n,)."""
+    """Read the numbers of a quantity (n,): lengths in metres, others as in the file; NaN: empty."""
     if _is_length(name, settings) and (fixed := _FIXED_LENGTH.fullmatch(spec)):
         return np.full(len(source), float(fixed[1]) * METRES[fixed[2]])
     numbers = source.numbers(spec, name)
@@ -259,7 +269,7 @@ def _quantity(source: Source, name: str, spec: str, settings: Settings) -> np.nd
 
 def _names(source: Source, name: str, spec: str, shared: pd.DataFrame,
            settings: Settings) -> np.ndarray:
-    """Read the names of devices, receivers or flights, (n,); `""`: none."""
+    """Read or make the names (n,) of devices, receivers or flights; `""`: none."""
     if name == "flight" and spec == BY_DAY:
         return calendar_days(shared["time_s"].to_numpy(), settings.time_zone)
     if name == "device" and spec == BY_POSITION:
@@ -274,7 +284,7 @@ def _names(source: Source, name: str, spec: str, shared: pd.DataFrame,
 
 
 def _level_columns(source: Source, settings: Settings) -> list[LevelColumn]:
-    """Return the column of levels, or those of all wide blocks."""
+    """Return the column of levels, or in a wide table (a column for each end) all of them."""
     if not settings.wide:
         return [LevelColumn(str(settings.columns.level), {})]
     found = [column for block in settings.wide for column in _wide_columns(source, block)]
@@ -287,7 +297,7 @@ def _level_columns(source: Source, settings: Settings) -> list[LevelColumn]:
 
 
 def _wide_columns(source: Source, block: Wide) -> list[LevelColumn]:
-    """Return the columns of levels that match the patterns of a block."""
+    """Return the columns of levels that fit a block's patterns, one for each device or receiver."""
     specs = block.model_dump(exclude_none=True, exclude={"level", "level_offset_db"})
     found: list[LevelColumn] = []
     names = list(map(str, source.table))
@@ -311,7 +321,7 @@ def _wide_columns(source: Source, block: Wide) -> list[LevelColumn]:
 
 
 def _naming_notes(source: Source, settings: Settings) -> list[str]:
-    """Note devices or receivers that are named after a pattern, which may be a misspelt column."""
+    """Note devices or receivers named by a pattern of a setting that may be a misspelt column."""
     notes = []
     for block in settings.wide:
         for end in ("device", "receiver"):
@@ -328,7 +338,10 @@ def _naming_notes(source: Source, settings: Settings) -> list[str]:
 
 
 def _match(pattern: str, name: str) -> str | None:
-    """Match a name with a pattern; return the text in place of `*`, or the name without `*`."""
+    """Match a name with a pattern; return the text that `*` stands for, None if it does not fit.
+
+    A pattern without `*` returns the whole name.
+    """
     if "*" not in pattern:
         return name if name == pattern else None
     before, after = pattern.split("*", 1)
@@ -346,7 +359,7 @@ def _column_name(settings: Settings, level: LevelColumn, name: str) -> str:
 
 def _drop_impossible_degrees(source: Source, links: pd.DataFrame, prefix: str, name: str, spec: str,
                         tally: Tally) -> pd.DataFrame:
-    """Drop links with an impossible latitude or longitude; BadInput if there are many."""
+    """Drop links with an impossible latitude or longitude; BadInput if many (`are_few`)."""
     limit = MAX_DEGREES[name]
     bad = links[prefix + name].abs() > limit
     if not are_few(bad.sum(), len(bad)):
@@ -462,7 +475,7 @@ def _unused(source: Source, settings: Settings) -> list[str]:
 
 
 def _declared_columns(settings: Settings) -> set[str]:
-    """Return the columns that the user's mapping names, in lower case."""
+    """Return the columns that the user's mapping names, in lower case, without patterns."""
     specs = settings.columns.model_dump(exclude_none=True).values()
     names = {name.lower() for spec in specs for name in columns_of(spec, ())}
     for block in settings.wide:
@@ -474,7 +487,11 @@ def _declared_columns(settings: Settings) -> set[str]:
 
 def _settings_for(source: Source, settings: Settings,
                  flight: str) -> tuple[Settings, str | None, str]:
-    """Complete the settings by those of the file's format; return also its name and caution."""
+    """Complete the settings by those of the file's format; return also its name and a caution.
+
+    The format is the declared one, else the one that fits the header; None if no format does.
+    `flight` is the default entry for the flight.
+    """
     header = list(map(str, source.table))
     found = None
     if settings.format:
@@ -498,7 +515,10 @@ def _settings_for(source: Source, settings: Settings,
 
 
 def _renumbered(source: Source, first: int, prefix: str) -> Source:
-    """Renumber the rows of a file from `first`, and put a prefix before their places."""
+    """Renumber the rows of a file from `first`, so that rows of several files differ.
+
+    Messages name them with `prefix`, which tells the file.
+    """
     where = source.where
     table = source.table.set_axis(pd.RangeIndex(first, first + len(source)))
     return replace(source, table=table, where=lambda index: f"{prefix}{where(index - first)}",
@@ -508,10 +528,11 @@ def _renumbered(source: Source, first: int, prefix: str) -> Source:
 
 
 def _drop_truncated_rows(source: Source, settings: Settings) -> Source:
-    """Drop rows that lack used columns; BadInput if there are many.
+    """Drop rows that were cut off before the last used column; BadInput if there are many.
 
-    Programs omit empty last cells. A row of a length of its own that ends with a used column may
-    have been truncated within that cell.
+    Short rows with all used columns stay, with a note: programs omit empty last cells. But a row
+    that ends with a used column, and is the only one of its length, may be cut off within that
+    cell.
     """
     header = list(map(str, source.table))
     specs = settings.columns.model_dump(exclude_none=True).values()
@@ -546,7 +567,10 @@ def _drop_truncated_rows(source: Source, settings: Settings) -> Source:
 
 def _file_links(source: Source, settings: Settings, tally: Tally, problems: Problems,
               name: str) -> tuple[pd.DataFrame, int]:
-    """Return the links of a file and its readings per row; count repeated and unselected rows."""
+    """Return the links of a file, and the number of readings in each of its rows.
+
+    Rows that repeat another, or that the setting `only` excludes, are counted in the tally.
+    """
     unique, repeated = without_repetition(source)
     chosen, others = _selected_rows(unique, settings)
     links, per_row = build_links(chosen, settings, tally, problems, name)
@@ -558,7 +582,11 @@ def _file_links(source: Source, settings: Settings, tally: Tally, problems: Prob
 
 def _selected_rows(source: Source, settings: Settings
                    ) -> tuple[Source, list[tuple[list[int], str, str]]]:
-    """Select rows by the setting `only`; return also indices, reason and column of the others."""
+    """Select the rows in which columns have the values of the setting `only`.
+
+    Returned are also the indices of the others, the reason, and the column that decided. BadInput
+    if no row has a value.
+    """
     left_out = []
     for spec, values in settings.only.items():
         texts = [value for value in values if isinstance(value, str)]
@@ -578,7 +606,7 @@ def _selected_rows(source: Source, settings: Settings
 
 def _without_copies(source: Source, links: pd.DataFrame, starts: list[int],
                     tally: Tally) -> pd.DataFrame:
-    """Drop readings with a time that an earlier file also has."""
+    """Drop readings with a time that equal a reading of an earlier file in all but the flight."""
     if "time_s" not in links:
         return links
     file = np.searchsorted(starts, links.index.to_numpy(), side="right")

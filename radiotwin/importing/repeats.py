@@ -82,7 +82,10 @@ def positions_m(links: pd.DataFrame) -> np.ndarray:
 
 def _bins(links: pd.DataFrame, track: np.ndarray,
           length_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the bin of each row, (n,) ascending, and the first row of each bin of a length [m]."""
+    """Divide tracks into bins of a length [m]; return each row's bin (n,) and each first row.
+
+    Rows are sorted by `track` (n,), a label; the length is measured along the track.
+    """
     position_m = positions_m(links)
     step_m = np.linalg.norm(np.diff(position_m, axis=0, prepend=position_m[:1]), axis=1)
     starts = np.diff(track, prepend=-1) != 0
@@ -107,7 +110,11 @@ def _mean(values: np.ndarray, bin_index: np.ndarray, bins: int) -> np.ndarray:
 
 def _level(level_db: np.ndarray, bin_index: np.ndarray, count: np.ndarray,
            method: str) -> np.ndarray:
-    """Return the level of each bin [dB], (bins,); NaN = not detected."""
+    """Return the level of each bin [dB]: mean power, or with the `method` median the median.
+
+    `bin_index` (n,) is the bin of each level, and `count` the number in each bin. A bin with more
+    than half its levels NaN (not detected) is NaN; else these count as zero power (-inf dB).
+    """
     missed = np.isnan(level_db)
     if method == "power":
         power = np.where(missed, 0.0, 10 ** (np.nan_to_num(level_db) / 10))
@@ -142,7 +149,10 @@ def stay_representatives(links: pd.DataFrame, distance_m: float) -> np.ndarray:
 
 
 def _stays(position_m: np.ndarray, track: np.ndarray, distance_m: float) -> np.ndarray:
-    """Return the index of the stay of each reading, (n,) ascending."""
+    """Return the stay of each reading, an index (n,), of readings in the order of time.
+
+    A stay ends where the track does, or farther than `distance_m` from its first position.
+    """
     stay = np.empty(len(track), dtype=np.int64)
     number, current, limit_m2 = -1, None, distance_m**2
     x0 = y0 = z0 = 0.0
@@ -154,7 +164,7 @@ def _stays(position_m: np.ndarray, track: np.ndarray, distance_m: float) -> np.n
 
 
 def without_repetition(source: Source) -> tuple[Source, list[int]]:
-    """Drop rows that equal an earlier one in every column; return also their indices."""
+    """Drop rows that equal an earlier one in every column; return also the indices of these."""
     table = source.table
     objects = [name for name in table if table[name].dtype == object]  # lists have no hash
     comparable = table.astype(dict.fromkeys(objects, str)) if objects else table

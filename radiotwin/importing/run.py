@@ -53,7 +53,10 @@ DECIMALS = {"_m": 3, "_db": 4, "_dbm": 4, "_deg": 4, "_s": 6}
 def _make_report(logs: Logs, notes: list[str], others: int, kept: int, tally: Tally,
                 positioned: PositionedLinks, measurements: Measurements,
                 settings: Settings) -> dict[str, Any]:
-    """Return the content of `import.json`; readings = kept + left out."""
+    """Return the content of `import.json`; its readings are those kept and those left out.
+
+    `others` is the number of files of other formats, `kept` that of the links before averaging.
+    """
     table, devices = measurements.table, measurements.devices
     origin = positioned.origin
     time_s = table["time_s"].dropna() if "time_s" in table else pd.Series(dtype=float)
@@ -99,6 +102,7 @@ def _ranges(table: pd.DataFrame, links: pd.DataFrame) -> dict[str, dict[str, Any
 
 
 def _position_warnings(measurements: Measurements, devices: str | None) -> Iterator[str]:
+    """Warn about implausible extents and heights, and devices without height or position."""
     receiver_m = measurements.receiver_m
     extent_m = np.linalg.norm(np.ptp(receiver_m[:, :2], axis=0))
     if extent_m > FAR_M:
@@ -128,6 +132,7 @@ def _position_warnings(measurements: Measurements, devices: str | None) -> Itera
 
 
 def _name_warnings(measurements: Measurements) -> Iterator[str]:
+    """Warn about names that are long numbers, of which a spreadsheet has cut the last digits."""
     for end in ("device", "receiver"):
         cut = [name for name in measurements.table[end].unique() if _CUT_NUMBER.fullmatch(name)]
         if cut:
@@ -137,6 +142,7 @@ def _name_warnings(measurements: Measurements) -> Iterator[str]:
 
 def _level_warnings(positioned: PositionedLinks, measurements: Measurements, tally: Tally,
                     readings: int) -> Iterator[str]:
+    """Warn about levels that look like codes: the smallest too often, or far from all others."""
     missed = np.isnan(measurements.level_db).mean()
     if missed > MAX_MISSED:
         yield f"{missed:.0%} of the levels are not detected"
@@ -162,6 +168,7 @@ def _level_warnings(positioned: PositionedLinks, measurements: Measurements, tal
 
 
 def _time_and_angle_warnings(table: pd.DataFrame) -> Iterator[str]:
+    """Warn about times outside the years `YEARS`, and headings that look like radians."""
     if "time_s" in table and table["time_s"].notna().any():
         first_s, last_s = table["time_s"].min(), table["time_s"].max()
         start_s, end_s = (datetime(year, 1, 1, tzinfo=UTC).timestamp() for year in YEARS)
@@ -174,6 +181,7 @@ def _time_and_angle_warnings(table: pd.DataFrame) -> Iterator[str]:
 
 
 def _averaging_warnings(measurements: Measurements, settings: Settings) -> Iterator[str]:
+    """Warn about a length of averaging outside of `WAVELENGTHS` (Lee 1985)."""
     if settings.average_m and "frequency_hz" in measurements.devices:
         frequency_hz = measurements.devices["frequency_hz"].median()
         length = in_wavelengths(settings.average_m, frequency_hz)
@@ -309,7 +317,7 @@ def _filtered(source: Source, positioned: PositionedLinks, settings: Settings,
 
 def _measurements(table: pd.DataFrame, devices: pd.DataFrame, level: str,
                   origin: Origin | None) -> Measurements:
-    """Make the measurements, with columns in order and values rounded."""
+    """Make the measurements: `level_db` renamed to `level`, columns in order, values rounded."""
     table = table.rename(columns={"level_db": level})
     order = ["time_s", *REQUIRED, level, *(name for name in OPTIONAL if name != "time_s")]
     table = table[[name for name in order if name in table]].reset_index(drop=True)
@@ -317,7 +325,7 @@ def _measurements(table: pd.DataFrame, devices: pd.DataFrame, level: str,
 
 
 def _with_antennas(measurements: Measurements, path: Path) -> Measurements:
-    """Add the antenna files that the table of devices at a path names."""
+    """Add the files of antennas that the table of devices at `path` names, under new names."""
     names = measurements.devices.get("antenna", pd.Series(dtype=str)).fillna("")
     if not names.any():
         return measurements

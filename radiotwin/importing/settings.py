@@ -37,7 +37,7 @@ QUANTITIES = (*POSITION, ABOVE_GROUND)
 
 
 def check_position(given: set[str], prefix: str) -> None:
-    """Raise ValueError unless given quantities are latitude, longitude or x, y, and one height."""
+    """Raise ValueError unless a position is whole: latitude, longitude or x, y; one height."""
     for pair in (("latitude", "longitude"), ("x", "y")):
         if len(given & set(pair)) == 1:
             raise ValueError(f"{prefix}{pair[0]} and {prefix}{pair[1]} are given together or not "
@@ -90,6 +90,7 @@ class Columns(Position):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
+        """Raise ValueError about columns that are incomplete, or contradict each other."""
         for prefix in ("", "device_"):
             check_position({name for name in QUANTITIES if getattr(self, prefix + name)}, prefix)
         if self.device == "by position" and not (self.device_latitude or self.device_x):
@@ -114,6 +115,7 @@ class Wide(Position):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
+        """Raise ValueError unless one of receiver and device is given, and a position is whole."""
         if (self.receiver is None) == (self.device is None):
             raise ValueError("needs either receiver or device: the name that belongs to each "
                              'column, such as receiver = "*"')
@@ -207,6 +209,7 @@ class Settings(Table):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
+        """Raise ValueError about settings that contradict each other."""
         if self.wide and self.columns.level:
             raise ValueError("columns.level and wide cannot both be given: the levels are in one "
                              "column or in many")
@@ -226,6 +229,7 @@ class Settings(Table):
     @field_validator("encoding")
     @classmethod
     def _known(cls, name: str | None) -> str | None:
+        """Return the name of a text encoding; ValueError if Python has no such encoding."""
         try:
             if name is not None:
                 codecs.getincrementaldecoder(name)
@@ -298,7 +302,10 @@ def read_settings(path: Path | str | None, given: Mapping[str, Any],
 
 
 def merged(settings: Settings, defaults: Mapping[str, Any]) -> Settings:
-    """Fill in defaults for settings that are not declared; a default position counts as a whole.
+    """Fill in defaults for settings that are not declared.
+
+    If any coordinate of a position is declared, no default coordinate of it is used; likewise for
+    heights.
 
     Raises:
         BadInput: the combination is not allowed.
@@ -319,7 +326,10 @@ def merged(settings: Settings, defaults: Mapping[str, Any]) -> Settings:
 
 
 def _table_of(settings: Path, name: str, data_folder: Path | None) -> Path:
-    """Return the path of a table that a settings file names; BadInput if it leads elsewhere."""
+    """Return the path of a table that a settings file names, relative to that file.
+
+    BadInput: it is outside the settings' folder, the current folder and that of the data.
+    """
     path = settings.parent / name
     if not is_within(path, settings.parent, Path.cwd(), data_folder or Path.cwd()):
         raise BadInput(f"{settings}: {path} is neither in its folder nor in the current one, nor "
@@ -328,7 +338,7 @@ def _table_of(settings: Path, name: str, data_folder: Path | None) -> Path:
 
 
 def _key(problem: Mapping[str, Any]) -> str:
-    """Return the key of a pydantic error, such as `wide.0.level`, without the types in it."""
+    """Return the setting that a pydantic error is about, such as `wide.0.level`."""
     names = {*Settings.model_fields, *Columns.model_fields, *Wide.model_fields,
              *Origin.model_fields, *TrackFile.model_fields}
     extra = problem["type"] == "extra_forbidden"
@@ -337,7 +347,7 @@ def _key(problem: Mapping[str, Any]) -> str:
 
 
 def _source_of(problem: Mapping[str, Any], path: Path | None, given: Mapping[str, Any]) -> str:
-    """Return where a bad setting was given: an option, or the file."""
+    """Return where a bad setting was given, for a message: an option, or the settings file."""
     key = problem["loc"][0] if problem["loc"] else None
     if key in given:
         return f"--{str(key).replace('_', '-')}"
@@ -347,7 +357,7 @@ def _source_of(problem: Mapping[str, Any], path: Path | None, given: Mapping[str
 
 
 def _message(problem: Mapping[str, Any], source: str | None) -> str:
-    """Return the message about a pydantic error."""
+    """Return the message about a pydantic error: its source, the setting, and the reason."""
     key = _key(problem)
     reason = problem["msg"].removeprefix("Value error, ")
     table = problem["loc"][0] if problem["loc"] else ""
@@ -365,9 +375,9 @@ def _message(problem: Mapping[str, Any], source: str | None) -> str:
 
 
 def write_settings(settings: Settings, path: Path, folder: Path) -> None:
-    """Write the settings that differ from the defaults as TOML.
+    """Write the settings that differ from the defaults as TOML to a (temporary) path.
 
-    Paths of tables become relative to `folder`, in which the file will be.
+    Paths of tables and tracks become relative to `folder`, where the file will lie in the end.
     """
     data = settings.model_dump(exclude_none=True, exclude_defaults=True)
     for table in ("devices", "receivers"):

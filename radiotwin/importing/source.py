@@ -30,7 +30,7 @@ _FEW, _FEW_SHARE = 20, 0.1  # number and share of damaged rows in a file that is
 
 
 def are_few(number: int, total: int) -> bool:
-    """Return whether the damaged rows are so few that they may be dropped without asking."""
+    """Return whether damaged rows are few (at most 20, and 10 %): they may just be dropped."""
     return number <= min(_FEW, _FEW_SHARE * total)
 
 
@@ -51,7 +51,7 @@ class BadRows:
     fresh: dict[int, str] = field(default_factory=dict)
 
     def add(self, where: str, column: str, cell: object, reason: str) -> bool:
-        """Note a bad row; return False if that exceeds the limit."""
+        """Note a bad row to leave out; return False, and do not, if that exceeds the limit."""
         if where not in self.rows and len(self.rows) >= self.limit:
             return False
         self.rows.setdefault(where, {"row": where, "column": column, "cell": cell_text(cell),
@@ -60,7 +60,7 @@ class BadRows:
 
     def take(self, source: "Source", spec: str, cells: pd.Series, rows: np.ndarray,
              reason: str) -> bool:
-        """Note several bad rows of a column; return False, and note none, if they exceed it."""
+        """Note several bad rows of a column; return False, and note none, if that is too many."""
         index = [int(cells.index[row]) for row in rows] if len(rows) <= self.limit else []
         places = [source.where(each) for each in index]
         if not places or len(self.rows.keys() | set(places)) > self.limit:
@@ -76,7 +76,10 @@ class BadRows:
 
     def without(self, links: pd.DataFrame, tally: "Tally", readings: int,
                 where: Callable[[int], str]) -> pd.DataFrame:
-        """Drop the rows that were noted since the last call; each counts as `readings` readings."""
+        """Drop the links of rows that were noted since the last call, and count them in the tally.
+
+        Each row counts as `readings` readings; noted rows are forgotten.
+        """
         fresh, self.fresh = self.fresh, {}
         for spec in dict.fromkeys(fresh.values()):
             bad = links.index[links.index.isin([row for row in fresh if fresh[row] == spec])]
@@ -192,9 +195,10 @@ class Source:
         return numbers
 
     def refuse(self, spec: str, cells: pd.Series, bad: ArrayLike, reason: str) -> None:
-        """Raise BadInput about the first bad cell of a column, or note all as allowed bad rows.
+        """Raise BadInput about bad cells (a mask) of a column, unless so many may be bad.
 
-        The message names file, row and column, and ends with the reason.
+        Allowed ones are noted in `bad_rows`. The message names file, row and column of the first
+        one, and ends with the reason.
         """
         rows = np.flatnonzero(np.asarray(bad, dtype=bool))
         if not len(rows):
@@ -211,9 +215,9 @@ class Source:
 
 
 def columns_of(spec: str, header: Iterable[object]) -> list[str]:
-    """Return the columns that an entry of a mapping names, see `Source.cells`.
+    """Return the columns in an entry of a mapping: a name, names in braces, or none (`always X`).
 
-    A name in the header may contain braces itself.
+    An entry that is in the header is that column, also if it has braces.
     """
     if spec.startswith(ALWAYS) and spec not in header:
         return []
@@ -236,7 +240,7 @@ class Problems:
 
     @contextmanager
     def noted(self) -> Iterator[None]:
-        """Catch a `BadInput` of the block and keep its message."""
+        """Catch a `BadInput` of the block and keep its message, so that others are found, too."""
         try:
             yield
         except BadInput as error:
@@ -277,7 +281,10 @@ class Tally:
 
     def drop(self, links: pd.DataFrame, bad: ArrayLike, reason: str, column: str,
              where: Callable[[int], str]) -> pd.DataFrame:
-        """Drop and count bad links, a mask (n,); `where` is that of their `Source`."""
+        """Drop the links of a mask (n,), and count them under a reason and a column.
+
+        `where` tells the place of a link in its file, for the first one that is dropped.
+        """
         bad = np.asarray(bad, dtype=bool)
         if not bad.any():
             return links

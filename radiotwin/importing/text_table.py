@@ -140,7 +140,10 @@ def fits(row: Sequence[str], columns: int) -> bool:
 
 
 def is_comment(row: Sequence[str], columns: int, first: Sequence[Sequence[str]]) -> bool:
-    """Return whether a row is a comment: it begins with a mark, unlike the first row."""
+    """Return whether a row is a comment: it begins with a mark such as `#`.
+
+    If the `first` row does too, a comment is only a row that does not fit the `columns`.
+    """
     mark = _COMMENT.match(row[0]) if row else None
     if mark is None:
         return False
@@ -154,7 +157,7 @@ def has_other_lines(cells: pd.DataFrame) -> bool:
 
 
 def _is_of_units(rows: Sequence[Sequence[str]], columns: int) -> bool:
-    """Return whether the first of two rows is one of units: no digits, above several numbers."""
+    """Return whether the first of two rows has units: no digits, above at least two numbers."""
     if len(rows) < 2 or not fits(rows[0], columns) or _COMMENT.match(rows[0][0]):
         return False
     digits = [any(character.isdigit() for character in above) for above in rows[0]]
@@ -165,7 +168,7 @@ def _is_of_units(rows: Sequence[Sequence[str]], columns: int) -> bool:
 
 
 def header_names(fields: Sequence[str]) -> list[str]:
-    """Return unique column names: empty and repeated ones get a number, a last empty one goes."""
+    """Return column names: empty and repeated ones get a number, an empty last one is left out."""
     names = [re.sub("[\u200b\ufeff]", "", name).strip() for name in fields]  # zero-width
     if names and (mark := _COMMENT.match(names[0])):  # as NumPy writes a header
         names[0] = names[0][mark.end():].strip() or names[0]
@@ -189,7 +192,10 @@ def _lines(number: int, where: str) -> str:
 
 def _scan(content: IO[bytes], file: LogFile,
           declared: str | None) -> tuple[bytes, bytes, bool, str]:
-    """Read a text once; return its first and last block, whether that is all, and its encoding."""
+    """Read a text once, to find its encoding.
+
+    Returned are its first and last block, whether the first is all of it, and the encoding.
+    """
     head = tail = content.read(_BLOCK_BYTES)
     encoding = codecs.lookup(declared).name if declared else next(
         (name for bom, name in _BOMS if head.startswith(bom)), "utf-8")
@@ -239,7 +245,7 @@ def _fields(line: str, delimiter: str) -> list[str]:
 
 
 def _with_tabs(line: str, delimiter: str) -> str:
-    """Replace the separating runs of blanks of a line by tabs, outside quotation marks."""
+    """Replace runs of blanks by tabs outside quotation marks, if blanks are the delimiter."""
     if delimiter not in BLANKS:
         return line
     return _RUNS[delimiter].sub(lambda run: run[0] if run[0].startswith('"') else "\t",
@@ -286,6 +292,7 @@ def _header(lines: list[str], settings: Settings,
 
 
 def _is_number(text: str) -> bool:
+    """Return whether a text is a number, with a decimal point or comma."""
     try:
         float(text.replace(",", "."))
     except ValueError:
@@ -459,7 +466,7 @@ def _read(file: LogFile, dialect: Dialect, reader: Iterator[list[str]],
 
 def _without_last(reader: Iterator[list[str]], lines: Lines,
                   after: int) -> Iterator[tuple[int, list[str]]]:
-    """Yield the rows that are not blank with their line numbers, without the last `after` rows."""
+    """Yield line number and fields of rows that are not blank, except the last `after` ones."""
     waiting: deque[tuple[int, list[str]]] = deque()
     for row in reader:
         if any(field.strip() for field in row):
@@ -469,7 +476,7 @@ def _without_last(reader: Iterator[list[str]], lines: Lines,
 
 
 def _cells(rows: list[list[str]], names: list[str], decimal: str) -> pd.DataFrame:
-    """Make a table of texts, with decimal points."""
+    """Make a table of texts from rows, with points in place of decimal commas."""
     table = unescape_formulas(pd.DataFrame(rows, columns=names, dtype=str))
     if decimal == ",":
         for name in names:

@@ -102,17 +102,7 @@ def seconds(source: Source, spec: str, time_format: str | None, zone: str | None
 
 def past_midnights(source: Source, spec: str, time_s: np.ndarray,
                    ends: Callable[[], np.ndarray]) -> tuple[np.ndarray, str]:
-    """Add a day after each midnight, if the date of the times is a constant; note clocks set back.
-
-    Args:
-        source: the file.
-        spec: of the times, possibly with a constant date.
-        time_s: (n,) [s].
-        ends: returns a label (n,) of each row's device and receiver, within which times ascend.
-
-    Returns:
-        the times (n,) [s], and a note, or `""`.
-    """
+    """Add a day after each midnight if the date is a constant; else note clocks that go back."""
     known = np.flatnonzero(np.isfinite(time_s))
     step_s = np.diff(time_s[known])
     falls = step_s < -BACK_S
@@ -195,7 +185,7 @@ def _parse(source: Source, spec: str, text: pd.Series, time_format: str) -> pd.S
 
 
 def _plausible(source: Source, spec: str, text: pd.Series, time_s: np.ndarray) -> np.ndarray:
-    """Return times (n,) [s]; BadInput if one is outside `YEARS`."""
+    """Return times (n,) [s since 1970] unchanged; BadInput if one is outside the years `YEARS`."""
     year = 1970 + time_s / SECONDS_PER_YEAR
     source.refuse(spec, text, (year < YEARS[0]) | (year > YEARS[1]),
                   f"lies outside of the years {YEARS[0]} to {YEARS[1]}; is time_format right "
@@ -205,7 +195,7 @@ def _plausible(source: Source, spec: str, text: pd.Series, time_s: np.ndarray) -
 
 def _localize(source: Source, spec: str, text: pd.Series, parsed: pd.Series,
               zone: str) -> pd.Series:
-    """Add a zone to local times; BadInput on a time that was skipped or occurred twice."""
+    """Add a zone to local times; BadInput if a clock change skipped or repeated one of them."""
     known = parsed.notna()
     local = parsed.dt.tz_localize(zone, ambiguous="NaT", nonexistent="shift_forward")
     source.refuse(spec, text, known & local.isna(),
@@ -217,7 +207,11 @@ def _localize(source: Source, spec: str, text: pd.Series, parsed: pd.Series,
 
 
 def clock_notes(links: pd.DataFrame) -> list[str]:
-    """Note receivers that would be at two places at once by their times."""
+    """Note receivers that would be at two places at once by the times of their readings.
+
+    They are if `MIN_PAIRS` successive readings, and a share `MIN_SHARE`, lie too far apart for the
+    time between them.
+    """
     if "time_s" not in links:
         return []
     notes = []
@@ -292,7 +286,9 @@ class Levels:
 
 def read_levels(source: Source, spec: str, settings: Settings,
                 offset_db: float | np.ndarray = 0.0) -> Levels:
-    """Read the levels of one column, and add an offset [dB], one for all or (n,).
+    """Read the levels of one column [dB or dBm], and add an offset [dB], one for all or (n,).
+
+    NaN: not detected, not measured, or impossible; the result says which.
 
     Raises:
         BadInput: the unit is not declared, a cell is not a number, or the meaning of empty cells is
@@ -335,9 +331,9 @@ def read_levels(source: Source, spec: str, settings: Settings,
 
 
 def _refuse_uncalibrated(source: Source, spec: str, db: np.ndarray, high_db: float) -> None:
-    """Raise BadInput if many levels (n,) [dB] are impossibly strong, from `high_db` on.
+    """Raise BadInput if many levels (n,) [dB] are `high_db` or more, as of no calibrated receiver.
 
-    A code for "no reading" would be one or two values with a gap to the others.
+    Few values with a gap to the others are no fault, but a code for "no reading".
     """
     over = np.unique(db[db >= high_db])
     share = float(np.mean(db >= high_db)) if len(db) else 0.0
@@ -357,7 +353,8 @@ def _is_one_of(text: pd.Series, numbers: np.ndarray, values: list[float | str],
                is_text: bool) -> np.ndarray:
     """Return which cells (n,) equal one of the values; upper and lower case are equal.
 
-    In a column of texts the word NaN is not an empty cell.
+    `empty` and the words for it mean an empty cell; but in a column of texts (`is_text`) the word
+    NaN is a value of its own.
     """
     labels = {value.strip().lower() for value in values if isinstance(value, str)}
     labels = {label if label == NOT_A_NUMBER and is_text else
@@ -369,7 +366,7 @@ def _is_one_of(text: pd.Series, numbers: np.ndarray, values: list[float | str],
 
 
 def _check_unit(source: Source, spec: str, numbers: np.ndarray, unit: str | None) -> None:
-    """Raise BadInput if the unit of levels is not declared."""
+    """Raise BadInput if the unit of levels is not declared; the message shows their range."""
     if unit is None:
         values = "are all not detected"
         if len(numbers):

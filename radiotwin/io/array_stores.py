@@ -115,7 +115,7 @@ def _check_array(array: h5py.h5d.DatasetID, path: Path, name: str, heap_bytes: i
 
 
 def _check_inflation(array: h5py.h5d.DatasetID, chunk_bytes: int, what: str) -> None:
-    """Check that no chunk decompresses to far more than its size: HDF5 would inflate it all."""
+    """Check that no compressed chunk becomes far larger than declared; HDF5 would inflate it."""
     stored: list[tuple[tuple[int, ...], int]] = []
     array.chunk_iter(lambda info: stored.append((info.chunk_offset, info.size)))
     for offset, size in stored:
@@ -157,7 +157,7 @@ def _is_text(kind: h5py.h5t.TypeID) -> bool:
 
 
 def _largest_heap(file: IO[bytes]) -> int:
-    """Return the size [bytes] of the largest heap of an HDF5 file, which bounds its texts.
+    """Return the size [bytes] of the largest heap in an HDF5 file: no text in it is longer.
 
     HDF5 knows the length of a text only after reading it. A heap begins with `GCOL`, a version,
     three zeros and its size (HDF5 File Format Specification 3.0, III.E); the same eight bytes occur
@@ -262,7 +262,7 @@ def _check_zarr_array(folder: Path, streamed: Budget) -> int:
 
 
 def _described(folder: Path, described: dict[str, Any], streamed: Budget) -> _Array:
-    """Check the metadata of a Zarr array, and return its chunks."""
+    """Check the metadata of a Zarr array against the budgets; return how it is cut into chunks."""
     MAP_ATTRIBUTES.check(len(described.get("attributes", {})), f"{folder}: its attributes")
     shape = _sizes(described["shape"], 0)
     if described["chunk_grid"]["name"] != "regular" or described.get("storage_transformers"):
@@ -296,7 +296,7 @@ def _sizes(values: Any, least: int) -> tuple[int, ...]:
 
 
 def _kind(folder: Path, data_type: Any) -> tuple[str, int]:
-    """Return the name of a Zarr data type, and the bytes of one value."""
+    """Return the name of a Zarr data type, and the bytes of one value; BadInput on others."""
     if isinstance(data_type, str) and data_type in _ITEM_BYTES:
         return data_type, _ITEM_BYTES[data_type]
     if isinstance(data_type, dict) and data_type.get("name") == _TEXT:
@@ -318,7 +318,10 @@ def _codecs(folder: Path, codecs: Any) -> tuple[str | None, bool]:
 
 
 def _check_pieces(path: Path, grid: tuple[int, ...], array: _Array) -> int:
-    """Check names and sizes of the chunks below a path; return their number."""
+    """Check names and sizes of an array's chunk files below a path; return their number.
+
+    Each dimension is a level of folders; `grid` is the number of chunks along those below `path`.
+    """
     if not grid:
         _check_piece(path, array)
         return 1

@@ -82,7 +82,7 @@ class CsvLayout:
                            "columns")
 
     def _blocks(self, file: IO[bytes]) -> Iterator[bytes]:
-        """Yield blocks of complete lines of UTF-8 text."""
+        """Yield blocks of whole lines of UTF-8 text, without a byte-order mark."""
         rest = file.read(3).removeprefix(b"\xef\xbb\xbf")
         while data := file.read(_BLOCK_BYTES):
             whole, newline, rest_of_data = data.rpartition(b"\n")
@@ -131,7 +131,7 @@ class CsvLayout:
         self._add(len(fields))
 
     def _check_fields(self, blocks: Iterable[bytes]) -> None:
-        """Check rows with quotation marks, or with line ends of any kind."""
+        """Check rows with quotation marks, or with any line ends, by parsing them as CSV."""
         lines = (line for block in blocks
                  for line in re.findall(r"[^\r\n]*(?:\r\n|\r|\n)|[^\r\n]+$", block.decode()))
         try:
@@ -309,7 +309,7 @@ def listed(names: Iterable[object]) -> str:
 
 def _selected(path: Path, names: list[str], required: Collection[str],
               optional: Collection[str] | None) -> list[str]:
-    """Check the names of all columns, and return those to read, in their order."""
+    """Check the names of all columns; return those that are required or optional (None: all)."""
     repeated = pd.Index(names, dtype=object).duplicated()
     if repeated.any():
         name = names[int(np.argmax(repeated))]
@@ -403,7 +403,7 @@ def _is_text(kind: Any) -> bool:
 
 
 def _decoded_bytes(column: Any) -> int:
-    """Return the size of an Arrow array in memory, without its dictionary."""
+    """Return the memory [bytes] of an Arrow array when decoded, with a repeated text each time."""
     import pyarrow
     from pyarrow import compute
 

@@ -38,7 +38,7 @@ def content_hash(value: Any) -> str:
 
 
 def _add(digest: Any, value: Any) -> None:
-    """Add a value to a hash: a letter for its kind, its length, its content."""
+    """Add a value to a hash, in place: a letter for its kind, its length, its content."""
     if value is None or isinstance(value, bool | np.bool_):
         digest.update(f"b{value}".encode())
     elif isinstance(value, np.ndarray):
@@ -85,7 +85,7 @@ def _add_class(digest: Any, kind: type) -> None:
 
 
 def _object_hash(value: Any) -> bytes:
-    """Return the hash of an object of this package; cached if it is immutable."""
+    """Return the hash of a class and its fields or attributes; cached for immutable objects."""
     kind = type(value)
     parameters = getattr(kind, "__dataclass_params__", None)
     is_immutable = kind.__hash__ is object.__hash__ and (

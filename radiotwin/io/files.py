@@ -38,10 +38,7 @@ def is_temporary(path: Path) -> bool:
 
 
 def require_writable(path: Path | str) -> None:
-    """Check that a file can be written; call it before long work.
-
-    Args:
-        path: of the file.
+    """Check, before long work, that a file can be written.
 
     Raises:
         BadInput: the folder cannot be made or written, or `path` is not an ordinary file.
@@ -96,8 +93,8 @@ def atomic_file(path: Path | str, hide_errors: bool = False) -> Iterator[IO[byte
 
     Args:
         path: of the file; missing folders are made.
-        hide_errors: raise the first error of a write at the end only, for libraries that crash on
-            it or swallow it (HDF5); until then, further writes go to memory.
+        hide_errors: raise an error of a write only at the end of the block, for libraries that
+            crash on it or swallow it (HDF5); what is written after it goes to memory.
 
     Yields:
         binary file, open for reading and writing.
@@ -151,7 +148,7 @@ def atomic_folder(path: Path | str, names: Collection[str] | None = None) -> Ite
 
 def require_folder(path: Path | str, names: Collection[str], mark: str | None = None,
                    keep_others: bool = False) -> None:
-    """Check that a folder can be written without loss of foreign files; call it before long work.
+    """Check, before long work, that a folder can be written and no foreign file is lost.
 
     Args:
         path: of the folder.
@@ -210,7 +207,7 @@ class _ErrorsKept(io.RawIOBase):
         self.error: OSError | None = None
 
     def write(self, data: Any) -> int:
-        """Write to the file or, after an error, to memory."""
+        """Write to the file; after the first error, which is kept, write to memory instead."""
         data = memoryview(data).cast("B")
         if self.error is None:
             try:
@@ -227,7 +224,7 @@ class _ErrorsKept(io.RawIOBase):
         return len(data)
 
     def readinto(self, buffer: Any) -> int:
-        """Read from the file, overlaid by the data in memory."""
+        """Read from the file, with the data of failed writes, kept in memory, laid over it."""
         view = memoryview(buffer).cast("B")
         start = self._position
         stop = max(start, min(start + len(view), self._end))
@@ -252,6 +249,7 @@ class _ErrorsKept(io.RawIOBase):
         return self._position
 
     def truncate(self, size: int | None = None) -> int:
+        """Set the file's end, at the present position by default; an error is kept, not raised."""
         self._end = self._position if size is None else size
         if self.error is None:
             try:
@@ -270,6 +268,7 @@ class _ErrorsKept(io.RawIOBase):
         return True
 
     def close(self) -> None:
+        """Close the file; an error is kept, not raised."""
         if not self._file.closed:
             try:
                 self._file.close()
@@ -280,7 +279,7 @@ class _ErrorsKept(io.RawIOBase):
 
 @contextmanager
 def _temporary_folder(path: Path, suffix: str = "") -> Iterator[Path]:
-    """Make and lock an empty folder beside `path`; remove it in the end."""
+    """Make and lock an empty folder beside `path` for the block; remove it in the end."""
     _sweep(path.parent)
     name: str | None = None
     handle: int | None = None
@@ -301,7 +300,7 @@ def _temporary_folder(path: Path, suffix: str = "") -> Iterator[Path]:
 
 
 def _lock(name: str) -> int | None:
-    """Open and lock a folder; None if it does not exist any more."""
+    """Lock a folder and return its file handle; None if the folder does not exist any more."""
     try:
         handle = os.open(name, os.O_RDONLY)
     except FileNotFoundError:
@@ -329,7 +328,10 @@ def _sweep(folder: Path) -> None:
 
 
 def _remove_stale(path: Path, aside: bool) -> None:
-    """Remove a temporary folder unless its process lives; `aside`: first put back what it held."""
+    """Remove a temporary folder whose process has ended; an error is raised if it lives.
+
+    With `aside`, the older content that it holds is put back first.
+    """
     handle = os.open(path, os.O_RDONLY)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises if its process lives
@@ -357,7 +359,9 @@ def _is_one_of(name: str, patterns: Collection[str]) -> bool:
 
 
 def _temporaries_place(path: Path) -> Path:
-    """Return a path in the folder for temporaries of the folder `path`: its parent, or itself.
+    """Return a path beside which temporary folders for the folder `path` can be made.
+
+    That is `path` itself, so that they are in its parent, or a path inside it.
 
     A working folder, a link, a mount point (a container's volume), and a folder in a
     write-protected one cannot be renamed; then temporaries go inside.
@@ -419,7 +423,10 @@ def _locked(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def _parent_of(path: Path, only_tried: bool = False) -> Iterator[None]:
-    """Make the folders above `path`; remove the new ones again if nothing was written."""
+    """Make the folders above `path` for the block; remove the new ones if it fails.
+
+    With `only_tried`, they are removed in any case, if they are empty.
+    """
     written = False
     with _reported(path):
         new = [folder for folder in path.parents if not folder.exists()]
@@ -437,7 +444,7 @@ def _parent_of(path: Path, only_tried: bool = False) -> Iterator[None]:
 
 @contextmanager
 def _reported(path: Path, only_disk: bool = False) -> Iterator[None]:
-    """Turn an OSError, or only those of a full or failed disk, into a message about `path`."""
+    """Turn an OSError, or with `only_disk` that of a full or failed disk, into a message."""
     try:
         yield
     except OSError as error:

@@ -66,7 +66,7 @@ def require_within(folder: Path, path: Path, source: str) -> Path:
 
 
 def keep_inputs(out: Path, *read: Path | None) -> None:
-    """Raise BadInput if an output would replace a file or folder that the command reads."""
+    """Raise BadInput if writing `out` would replace a file or folder that the command reads."""
     for path in read:
         if path is not None and is_within(path, out):
             raise BadInput(f"cannot write {out}: the command reads {path}, which would be lost; "
@@ -77,10 +77,10 @@ def keep_others(out: Path, force: bool, *marks: str) -> None:
     """Raise BadInput if an output would replace a file that this program did not write.
 
     Args:
-        out: output of a command.
+        out: path that a command is to write.
         force: replace any file.
-        marks: columns by which a table of this command is recognised; other files are recognised
-            by the name of this program in them.
+        marks: columns by which a table of this command is recognised; other files are recognised by
+            the name of this program in them.
     """
     path, suffix = out / "zarr.json" if out.is_dir() else out, out.suffix.lower()
     if force or not path.is_file() or not path.stat().st_size:
@@ -260,6 +260,7 @@ class _Bounded(io.RawIOBase):
         return True
 
     def readinto(self, buffer: Any) -> int:
+        """Read into a buffer; BadInput once more bytes than the budget were decompressed."""
         data = _read(self._content, self._path, len(buffer))
         self._left -= len(data)
         if self._left < 0:
@@ -270,7 +271,7 @@ class _Bounded(io.RawIOBase):
 
 
 def _read(file: Any, path: object, size: int) -> bytes:
-    """Read from a file; BadInput if it is damaged or truncated."""
+    """Read up to `size` bytes from a file; BadInput if it is damaged or truncated."""
     try:
         return file.read(size)
     except (OSError, EOFError, zlib.error) as error:

@@ -51,7 +51,7 @@ _state = _State()
 
 
 def handle() -> None:
-    """Install the handlers; until `begin`, a signal ends the process with one line."""
+    """Install the handlers of signals; until `begin`, a signal ends the process with one line."""
     _state.raising, _state.after = False, None
     for number in NUMBERS:
         hung_up_ignored = (number not in (signal.SIGINT, signal.SIGTERM)
@@ -102,7 +102,7 @@ def word(number: int) -> str:
 
 @contextmanager
 def deferred() -> Iterator[None]:
-    """Delay signals until the end of the block, so that its steps are done together."""
+    """Delay signals until the end of the block, so that they cannot interrupt its steps."""
     if threading.current_thread() is not threading.main_thread():  # it gets no signals
         yield
         return
@@ -117,7 +117,7 @@ def deferred() -> Iterator[None]:
 
 @contextmanager
 def kept_from_children() -> Iterator[None]:
-    """Start processes in this block that ignore Ctrl-C; this process ends them."""
+    """Block Ctrl-C for processes that are started in this block; this process is to end them."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
@@ -132,7 +132,7 @@ def kept_from_children() -> Iterator[None]:
 
 
 def _on_signal(number: int, frame: FrameType | None) -> None:
-    """Raise `Stopped` during the work; before and after it end the process."""
+    """Handle a signal: raise `Stopped` during the work; before and after it, end the process."""
     if _state.raising:
         if _state.received is None:
             _state.received = number
@@ -160,7 +160,10 @@ def _on_alarm(number: int, frame: FrameType | None) -> None:
 
 
 def _raise_unless_flying() -> None:
-    """Raise `Stopped` unless one is being handled, and try again after `AGAIN_S`."""
+    """Raise `Stopped` for a signal, unless one raised before is still on its way up.
+
+    A timer tries again after `AGAIN_S`, as code on the way may swallow it. Deferred signals wait.
+    """
     if not _state.raising or _state.deferred:
         return
     if hasattr(signal, "setitimer"):
@@ -188,7 +191,7 @@ def note_finished() -> None:
 
 
 def after_interrupt() -> str:
-    """Return the part of a message that says which finished parts are kept, and how to go on."""
+    """Return the end of a message after an interrupt: what is kept, and how to go on."""
     if not _finished:
         return "nothing is kept; run the same command again"
     parts = "1 finished part is" if _finished == 1 else f"{_finished:,} finished parts are"

@@ -40,7 +40,7 @@ def shortly(value: float) -> str:
 
 
 def shown_data(value: Any) -> Any:
-    """Apply `shown` to every text in nested data, except packed arrays."""
+    """Apply `shown` to every text in nested lists and dictionaries, except packed arrays."""
     if isinstance(value, str):
         return shown(value)
     if isinstance(value, list):

@@ -82,12 +82,10 @@ def as_measurements(given: Measurements | pd.DataFrame | Path | str,
                     scene: Scene | None) -> Measurements:
     """Return measurements in the frame of a scene, from an object, a file or a data frame.
 
-    A file or a data frame is also checked against the map, see `in_scene_frame`. `Measurements` are
-    only converted, if both origins are known.
+    Positions read from a file or a data frame are also checked against the map, see
+    `in_scene_frame`. A `Measurements` object is not checked: it is converted if both origins are
+    known, else returned as it is. Without a scene positions stay as they are.
 
-    Args:
-        given: measurements, a data frame of links, or the path of a file.
-        scene: None: positions stay as they are.
 
     Raises:
         BadInput: `given` is none of these, cannot be read, or does not fit the scene.
@@ -127,9 +125,11 @@ def in_known_frame(measurements: Measurements, origin: Origin | None, owner: str
 
 
 def _require_fit(measurements: Measurements, scene: Scene) -> None:
-    """Check receivers against the map: warn if they fit badly, raise BadInput if they do not fit.
+    """Check that most receivers are outside the buildings and on the map of a scene.
 
-    The message proposes the translation that fits best.
+    At most a share `MAX_MISPLACED` may be inside, or off the map. More pass with a warning if
+    position errors of some metres explain it and no translation fits clearly better; else BadInput
+    proposes the best translation.
     """
     receiver_m = measurements.receiver_m
     receiver_m = receiver_m[np.isfinite(receiver_m).all(axis=1)]
@@ -198,16 +198,13 @@ class ShiftSearch:
 
 
 def search_shift(scene: Scene, receiver_m: np.ndarray) -> ShiftSearch | None:
-    """Search the horizontal translation that moves receivers out of buildings and onto the map.
+    """Search the translation that moves receivers (n, 3) [m] out of buildings and onto the map.
 
     Receivers follow streets: in the right frame far fewer are inside buildings than the building
-    density around them predicts. The search covers a grid of translations, at the receivers' median
-    height above the ground. 28,682 readings of a real drive test, moved by 94 to 316 m, were moved
-    back within 2 m.
-
-    Args:
-        scene: the 3D map.
-        receiver_m: (n, 3) [m].
+    density around them predicts. A translation is scored by its contrast: receivers inside
+    buildings minus the number that this density predicts, in standard deviations; the lowest wins.
+    The search covers a grid of translations, at the receivers' median height above the ground.
+    28,682 readings of a real drive test, moved by 94 to 316 m, were moved back within 2 m.
 
     Returns:
         the search result; None if no translation in range moves the receivers onto the map.

@@ -42,7 +42,8 @@ INDOORS = "it was indoors (see building_entry), or its position or the wall is o
 def height_notes(receiver_m: np.ndarray, scene: Scene) -> list[str]:
     """Note heights that seem to be measured from another zero than the datum of the scene.
 
-    Receivers are (n, 3) [m], with z above that datum; NaN: unknown.
+    A note is made if most receivers would be below the ground, or nearly all of them more than
+    `HIGH_M` above it. Receivers are (n, 3) [m], with z above that datum; NaN: unknown.
     """
     known = np.isfinite(receiver_m).all(axis=1)
     if not known.any():
@@ -72,14 +73,10 @@ def height_notes(receiver_m: np.ndarray, scene: Scene) -> list[str]:
 
 def chance_inside(city: CityMap, position_m: np.ndarray,
                   sd_m: float = POSITION_SD_M) -> np.ndarray:
-    """Return the probability (n,) that a link's end is inside a building.
+    """Return the probability (n,) that each position is really inside a building of the map.
 
-    The error of its position is normal, and sampled on rings of equal probability.
-
-    Args:
-        city: 3D map.
-        position_m: (n, 3) reported positions [m].
-        sd_m: standard deviation of their errors in x and in y [m].
+    The true position scatters about the reported one (n, 3) [m], normally, with `sd_m` in x and in
+    y; it is sampled on circles of equal probability.
     """
     places_m, place = np.unique(position_m, axis=0, return_inverse=True)
     share = (np.arange(RINGS) + 0.5) / RINGS
@@ -112,7 +109,7 @@ def copied_rows(table: pd.DataFrame) -> np.ndarray:
 
 
 def require_one_frame(measurements: Measurements, scene: Scene | None) -> None:
-    """Raise BadInput if measurements and scene have different origins."""
+    """Raise BadInput if measurements and scene have different origins; an unknown one passes."""
     origin, of_scene = measurements.origin, None if scene is None else scene.config.origin
     if origin is not None and of_scene is not None and not is_same_frame(origin, of_scene):
         raise BadInput(f"the measurements are in the frame about {origin_text(origin)}, the scene "
@@ -140,12 +137,12 @@ def check_names(measurements: Measurements) -> list[str]:
 
 def check_positions(receiver_m: np.ndarray, device_m: np.ndarray,
                     scene: Scene | None) -> list[str]:
-    """Note positions that are probably in another unit or frame.
+    """Note positions that are probably in another unit or frame, as all lie within `CLOSE_M`.
 
     Args:
         receiver_m: (n, 3) [m].
         device_m: (k, 3) [m].
-        scene: with the 3D map; None: positions are not compared with one.
+        scene: with the 3D map; None: there is no map to compare positions with.
 
     Raises:
         BadInput: all receivers and devices are within `CLOSE_M`, or most receivers are outside the
@@ -172,7 +169,8 @@ def check_positions(receiver_m: np.ndarray, device_m: np.ndarray,
 def require_on_map(receiver_m: np.ndarray, scene: Scene, remedy: str = "") -> np.ndarray:
     """Return which receivers (n, 3) [m] are outside the 3D map, (n,) bool; BadInput if most are.
 
-    The message ends with the remedy; by default it tells another place from another frame.
+    The message ends with `remedy`. By default it says that the map is of another place if it is
+    more than `ELSEWHERE_M` away, else that positions are in another frame.
     """
     outside = outside_map(receiver_m, scene)
     if outside.sum() > MAX_OUTSIDE * len(outside):
@@ -191,10 +189,10 @@ def require_on_map(receiver_m: np.ndarray, scene: Scene, remedy: str = "") -> np
 
 
 def unmapped_ends(receiver_m: np.ndarray, device_m: np.ndarray, scene: Scene) -> np.ndarray:
-    """Return which links (n,) have an end off the 3D map and below its roofs.
+    """Return which links (n,) have an end that is beside the 3D map and below its roofs.
 
-    Their line of sight is unknown. An end above the roofs needs no map around it. Both ends are
-    (n, 3) [m]; NaN: unknown.
+    Whether such a link has line of sight is unknown, since what stands around that end is not
+    mapped; an end above the roofs needs no map around it. Both ends are (n, 3) [m]; NaN: unknown.
     """
     low_m, high_m = map_corners_m(scene)
     roof_m = _roof_m(scene)
@@ -240,14 +238,11 @@ def receiver_notes(receiver_m: np.ndarray, scene: Scene) -> list[str]:
 
 
 def move_anchors_out(links: Links, scene: Scene, refuse: bool = True) -> Links:
-    """Move anchors out of buildings and above the ground of the map, with a note.
+    """Move anchors (devices of declared position) out of buildings and above the map's ground.
 
-    An anchor is moved only within the errors of a map, see `radiotwin.scene.footing`.
+    An anchor is moved only by as much as a map may be wrong, see `radiotwin.scene.footing`; a note
+    says which ones were moved. Without `refuse`, one that is too deep inside stays there.
 
-    Args:
-        links: over the map of the scene.
-        scene: with the 3D map.
-        refuse: raise for an anchor that is too deep inside a building; else it stays there.
 
     Raises:
         BadInput: an anchor is far from the receivers, or too deep inside a building.
@@ -285,7 +280,7 @@ def move_anchors_out(links: Links, scene: Scene, refuse: bool = True) -> Links:
 
 def uninformative_receivers(table: pd.DataFrame, level_db: np.ndarray,
                       keep: np.ndarray) -> list[tuple[np.ndarray, str]]:
-    """Find receivers that never detect, always read one level, or have too few links.
+    """Find receivers that detect nothing, read one level only, or have few links that are used.
 
     Args:
         table: n measurements.
@@ -293,7 +288,8 @@ def uninformative_receivers(table: pd.DataFrame, level_db: np.ndarray,
         keep: (n,) bool, links that are used so far.
 
     Returns:
-        for each of the three, a mask (n,) of their links, and the reason to leave them out.
+        for each of the three faults, a mask (n,) of the links of such receivers, which may be all
+        false, and the reason to leave them out.
     """
     end, names = pd.factorize(table["receiver"], sort=True)
     links = np.bincount(end[keep], minlength=len(names))
@@ -316,10 +312,12 @@ def uninformative_receivers(table: pd.DataFrame, level_db: np.ndarray,
 
 def unheard_devices(table: pd.DataFrame, level_db: np.ndarray,
                     keep: np.ndarray) -> tuple[np.ndarray, str]:
-    """Find devices that were never detected on at least `MIN_LINKS` links, and may be off.
+    """Find devices that were never detected on `MIN_LINKS` or more links, as if switched off.
 
-    A device with fewer links may be one position of a moving device: its blanks are kept. Arguments
-    and result are those of `uninformative_receivers`, for one reason.
+    A device with fewer links may be one position of a moving device, where it is information that
+    it was not detected. For levels (n,) [dB], NaN = not detected, of the rows `keep` (n,) of
+    `table`, the result is a mask (n,) of the links of such devices, and the reason to leave them
+    out.
     """
     end, names = pd.factorize(table["device"], sort=True)
     links, heard = (np.bincount(end[rows], minlength=len(names))
@@ -333,7 +331,8 @@ def unheard_devices(table: pd.DataFrame, level_db: np.ndarray,
 def find_fill_value(level_db: np.ndarray) -> tuple[float | None, float]:
     """Find the level that a receiver writes in place of "not detected", if there is one.
 
-    It is the lowest level (n,) [dB], far below the next ones or far more frequent.
+    It is the lowest level (n,) [dB], NaN = not detected, if it is far more frequent than the next
+    ones, or occurs three times and lies far below them (by 3 dB, and by ten usual steps).
 
     Returns:
         that level [dB], None if there is none, and its share of all readings.
@@ -350,12 +349,9 @@ def find_fill_value(level_db: np.ndarray) -> tuple[float | None, float]:
 
 
 def ceiling_notes(receiver: np.ndarray, names: Sequence[str], level_db: np.ndarray) -> list[str]:
-    """Note receivers that saturate: their highest value is far more frequent than the next ones.
+    """Note receivers that saturate: their highest level is far more frequent than the next ones.
 
-    Args:
-        receiver: (n,) index of each link's receiver.
-        names: of the receivers.
-        level_db: (n,) [dB]; NaN = not detected.
+    `receiver` (n,) is an index into `names`; levels (n,) are NaN where nothing was detected.
     """
     found = []
     for number, levels in pd.Series(level_db).dropna().groupby(receiver[np.isfinite(level_db)]):

@@ -44,10 +44,12 @@ REMEMBERED = 8  # cached variograms: a model and its folds
 
 
 def pairs_of_links(place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return first and second rows (p,) of pairs of links: near neighbours, and lags along tracks.
+    """Choose pairs of links to compare: each with its nearest neighbours and with later links.
 
-    Only links of one series are paired. Places (n, d) [m] hold both ends; their last coordinate
-    separates the series, see `_separated_places`.
+    Neighbours are the `NEIGHBOURS` nearest in `place` (n, d) [m], positions of both ends and a last
+    coordinate that tells series apart; later links are `LAGS` rows on. Only links of one series are
+    paired. Of more than `MAX_LINKS` links a sample, with a fixed seed so that results repeat, is
+    used. Returned are first and second row of each pair, (p,) each.
     """
     n = len(place)
     every = np.arange(n) if n <= MAX_LINKS else np.sort(
@@ -82,7 +84,11 @@ class Trend:
 
     @classmethod
     def of(cls, links: Links, rows: np.ndarray, series: np.ndarray) -> Trend:
-        """Build the basis for rows (m,) of links, of which `series` (n,) labels the flights."""
+        """Build the trend of rows (m,) of links: what is removed from residuals before comparing.
+
+        It is the mean of each flight, labelled by `series` (n,), and for at least `MIN_TREND_LINKS`
+        rows a slope over ln distance and two harmonics of the azimuth. The basis is orthonormal.
+        """
         label = series[rows]
         columns = (label[:, None] == np.unique(label)).astype(float)
         if len(rows) >= MIN_TREND_LINKS:
@@ -99,7 +105,7 @@ class Trend:
 
     def semivariances(self, position_m: np.ndarray, i: np.ndarray, j: np.ndarray,
                 lengths_m: np.ndarray) -> np.ndarray:
-        """Return the semivariances of detrended fields of unit variance for pairs of links.
+        """Compute semivariances of unit-variance fields without this trend, for pairs of links.
 
         Args:
             position_m: (n, d) positions of all links [m].
@@ -108,7 +114,8 @@ class Trend:
             lengths_m: (k,) correlation lengths [m].
 
         Returns:
-            (1 + k, p): of white noise, and of an exponential field of each length.
+            (1 + k, p): that of white noise, then that of a field whose correlation falls
+            exponentially over each length.
         """
         used, place = np.unique(np.concatenate([i, j]), return_inverse=True)
         a, b = place.reshape(2, -1)
@@ -154,7 +161,11 @@ class Variogram:
     @classmethod
     def of(cls, position_m: np.ndarray, trends: list[Trend], first: np.ndarray, second: np.ndarray,
            lengths_m: np.ndarray) -> Variogram:
-        """Compute the model variograms of links with both ends at (n, d) [m]."""
+        """Compute the model semivariance of pairs of links over distance, for correlation lengths.
+
+        Pairs are rows `first` and `second` (p,) of links with both ends at `position_m` (n, d).
+        Distance bins begin at the first of `lengths_m`, the shortest correlation length.
+        """
         distance_m, least_m = _distance_m(position_m, first, second), float(lengths_m[0])
         edges = np.geomspace(least_m, max(float(distance_m.max(initial=0)), 2 * least_m), BINS)
         index = np.searchsorted(edges, distance_m)
@@ -162,9 +173,11 @@ class Variogram:
                    _fields(position_m, trends, first, second, index, lengths_m), lengths_m)
 
     def length_m(self, z: np.ndarray) -> float:
-        """Fit the correlation length [m] to the variogram of scaled residuals (n,).
+        """Fit the correlation length [m] of residuals (n,), divided by their scale.
 
-        It is the first of `lengths_m` if they are uncorrelated, or too few bins have enough pairs.
+        The measured semivariance over distance (robust: Cressie and Hawkins) is compared with
+        `fields`, that of a model for each of `lengths_m`. The result is the shortest of these if
+        the residuals are uncorrelated, or too few distance bins have enough pairs.
         """
         detrended = np.empty(len(z))
         for trend in self.trends:
@@ -181,9 +194,11 @@ class Variogram:
 
 def _fields(position_m: np.ndarray, trends: list[Trend], first: np.ndarray, second: np.ndarray,
             index: np.ndarray, lengths_m: np.ndarray) -> np.ndarray:
-    """Average the semivariances of detrended fields in distance bins: `Variogram.fields`.
+    """Average the model semivariances of pairs of links in bins of distance.
 
-    Positions (n, d) [m] hold both ends; the other arguments are those of `Variogram`.
+    Pairs are rows `first` and `second` (p,) of links with both ends at `position_m` (n, d), both in
+    one of the trends; `index` (p,) is their bin. The result (1 + k, bins) is that of white noise,
+    then of a field of each length (k,) [m]; NaN in a bin without a pair.
     """
     trend_of = np.empty(len(position_m), dtype=int)
     for number, trend in enumerate(trends):
@@ -206,10 +221,12 @@ def _fields(position_m: np.ndarray, trends: list[Trend], first: np.ndarray, seco
 
 def _nearest(gamma: np.ndarray, pairs: np.ndarray, fields: np.ndarray,
              lengths_m: np.ndarray) -> float:
-    """Fit nugget and sill for each length (k,), and return the length [m] of the best fit.
+    """Return the correlation length [m] whose model semivariances fit the measured ones best.
 
-    `gamma` (b,) are empirical semivariances of `pairs` (b,) pairs in bins; `fields` (1 + k, b) are
-    those of white noise, and of a field of each length.
+    A nugget (uncorrelated part) and a sill (correlated part) of each length (k,) are fitted by
+    least squares to `gamma` (b,), measured in bins of `pairs` (b,) pairs; `fields` (1 + k, b) are
+    those of white noise, and of each length. It is the first length if no sill reaches a share
+    `MIN_CORRELATED`.
     """
     # Bins are dependent: beyond some hundreds of pairs, more make a bin no more certain.
     weight = np.sqrt(np.minimum(pairs, 500)) / np.maximum(gamma, 0.05 * gamma.max(initial=1e-9))
@@ -235,7 +252,7 @@ def devices_move(links: Links) -> bool:
 
 
 def moving_end_m(links: Links) -> np.ndarray:
-    """Return the positions (n, 3) [m] of the receivers, or of the devices if those move.
+    """Return receiver positions (n, 3) [m] of links, or device positions if the devices move.
 
     An unknown position is 0.
     """
@@ -258,7 +275,10 @@ def extent_m(position_m: np.ndarray) -> float:
 
 
 def median_step_m(links: Links) -> float:
-    """Return the median distance [m] between neighbouring positions of one device and receiver."""
+    """Return the median distance [m] between nearest positions of one device and receiver.
+
+    It is the distance of both ends together; 0 if there are fewer than two positions.
+    """
     place, offset_m = _separated_places(links, pair_label(links))
     places = pd.DataFrame(np.round(place / MIN_STEP_M)).drop_duplicates().to_numpy() * MIN_STEP_M
     if len(places) < 2:
@@ -272,12 +292,9 @@ def median_step_m(links: Links) -> float:
 def correlation_length_m(links: Links, z: np.ndarray) -> float:
     """Return the distance [m] over which the correlation of a residual falls to 1/e.
 
-    It lies between the median step between positions, which an uncorrelated residual gives, and a
-    quarter of the extent of the campaign.
-
-    Args:
-        links: n links; those not detected are ignored.
-        z: (n,) residuals, divided by their scale.
+    `z` (n,) are residuals divided by their scale; links not detected, or with NaN, are ignored. The
+    result is at least the median step between positions (that of an uncorrelated residual), and at
+    most a quarter of the extent of the campaign.
     """
     seen = np.isfinite(links.level_db) & np.isfinite(z)
     least_m, rows, variogram = _variogram(links, seen.tobytes())
@@ -286,10 +303,11 @@ def correlation_length_m(links: Links, z: np.ndarray) -> float:
 
 @lru_cache(maxsize=REMEMBERED)
 def _variogram(links: Links, seen: bytes) -> tuple[float, np.ndarray, Variogram | None]:
-    """Return the shortest length [m], the rows (m,) of detected links, and their model variogram.
+    """Prepare what is needed to fit a correlation length to residuals of detected links.
 
-    `seen` is the mask of detected links as bytes. The result is cached: it is slow, and every
-    effect and every step needs it for the same links.
+    `seen` is the mask of detected links as bytes: the key of a cache, as this takes long. Returned
+    are the shortest length [m], the indices (m,) of detected links in the variogram's order, and
+    the variogram; None if links are too few or the campaign is too small.
     """
     least_m, most_m = median_step_m(links), EXTENT_SHARE * extent_m(moving_end_m(links))
     rows = np.flatnonzero(np.frombuffer(seen, dtype=bool))
@@ -311,10 +329,12 @@ def _variogram(links: Links, seen: bytes) -> tuple[float, np.ndarray, Variogram 
 
 
 def _separated_places(links: Links, label: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the positions of both ends, and a coordinate that separates labels (n,).
+    """Return positions of both ends of links, with one more coordinate that sets labels apart.
+
+    Nearest neighbours in these coordinates always have the same label (n,).
 
     Returns:
-        (n, 7) [m], and the distance between labels in the last coordinate [m].
+        (n, 7) [m], and the distance [m] between two labels in the last coordinate.
     """
     ends_m = np.column_stack([links.receiver_m, np.nan_to_num(links.device_m[links.device])])
     offset_m = 4.0 * float(np.ptp(ends_m, axis=0).max(initial=0.0)) + 1.0

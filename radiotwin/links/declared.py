@@ -90,7 +90,11 @@ class Declared:
 
     @cached_property
     def fed_db(self) -> np.ndarray:
-        """(k,) part of a device's levels that no direction changes [dB]: power, cable, carrier."""
+        """Part of each device's level that no direction changes, (k,) [dB].
+
+        It is the transmit power, where levels are received powers, minus the cable loss, and minus
+        20 lg of the ratio of the device's carrier to the common one.
+        """
         fed_db = np.zeros(len(self.radios))
         for number, radio in enumerate(self.radios):
             fed_db[number] = radio.fed_dbm if self.has_power else -radio.cable_loss_db
@@ -138,11 +142,12 @@ class Declared:
         return not self.fed_db.any() and not self.has_antennas
 
     def added_db(self, device: np.ndarray, ray_m: np.ndarray) -> np.ndarray | float:
-        """Return what the radios add to the isotropic gains of links, along the straight line.
+        """Return declared power, cable loss and antenna gains of links: level minus isotropic gain.
 
         Args:
             device: (n,) index of each link's device.
-            ray_m: (n, 3) from the device to the receiver [m]; NaN if the device may be anywhere.
+            ray_m: (n, 3) straight line from the device to the receiver [m]; NaN if the device may
+                be anywhere.
 
         Returns:
             (n,) [dB]; the number 0 if nothing is declared.
@@ -158,11 +163,10 @@ class Declared:
         return added_db
 
     def with_radios(self, radios: dict[int, Radio]) -> Declared:
-        """Return a copy with newly declared values of some devices.
+        """Return a copy with new radios of some devices (by index); unchanged if none is declared.
 
-        Args:
-            radios: device index -> new radio. A value that it leaves open keeps the old one; a
-                transmit power that was unknown stays unknown.
+        Where a new radio declares no value, the old value stays. A transmit power is replaced only
+        if the old radio declared one, too.
         """
         if not self.radios:
             return self
@@ -177,10 +181,9 @@ class Declared:
         return replace(self, radios=tuple(updated))
 
     def of_devices(self, index: np.ndarray) -> Declared:
-        """Select and reorder the radios.
+        """Return a copy with the radios of other devices.
 
-        Args:
-            index: (j,) into `radios`, for each new device; -1: nothing is declared of it.
+        `index` (j,) tells the old device for each new one; -1: nothing is declared of it.
         """
         if self.adds_nothing:
             return NOTHING
@@ -275,10 +278,10 @@ def antenna_of_uavs(scene: Scene | None, receivers: Sequence[str]
 
 def match_learnt_law(names: Sequence[str], declared: Declared, learnt: Declared, scene: Scene | None
               ) -> tuple[Declared, list[str]]:
-    """Adapt the radios of new devices to a channel law that was learnt from other devices.
+    """Adapt the radios of new devices to a law of channel gain that was learnt from others.
 
-    If the law excludes transmit powers, missing ones are assumed; if it includes them, declared
-    ones are dropped.
+    If the law was learnt with declared transmit powers, missing ones are assumed; if it was learnt
+    without, the powers are part of the law, and declared ones are dropped.
 
     Args:
         names: of k new devices.
@@ -311,9 +314,9 @@ def match_learnt_law(names: Sequence[str], declared: Declared, learnt: Declared,
 
 def _with_powers(names: Sequence[str], radios: tuple[Radio, ...], known_dbm: list[float],
                  whose: str, scene: Scene | None) -> tuple[tuple[Radio, ...], list[str]]:
-    """Fill in missing transmit powers, with a note: the scene's power, else a median [dBm].
+    """Fill in missing transmit powers [dBm], with a note: the scene's power, else a median.
 
-    `whose` is what the median of `known_dbm` is called in the note.
+    It is the median of `known_dbm`, which the note calls `whose`; `names` are those of the devices.
     """
     usual_dbm = float(np.median(known_dbm))
     if scene is not None and scene.config.radio.declares_power:

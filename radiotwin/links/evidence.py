@@ -29,16 +29,17 @@ SAMPLE_LINKS = 60_000  # links in the sample; the loop takes minutes on them
 
 
 def evidence_blocks(links: Links) -> np.ndarray:
-    """Return the piece of evidence (n,) of each link, an index; links of one piece count as one.
+    """Return the index (n,) of the piece of evidence to which each link belongs.
 
-    They share device, receiver and flight, and a square of ground as wide as the correlation length
-    that `with_evidence` estimated, or `UNKNOWN_M` before that.
+    A piece is a group of links whose errors are alike, so that scores count it as one observation:
+    links of one device, receiver and flight on one square of ground. Its side is the correlation
+    length that `with_evidence` estimated, or `UNKNOWN_M` before that.
     """
     return _evidence(links)[:, 0]
 
 
 def places(links: Links) -> np.ndarray:
-    """Return the place (n,) of each link, an index: the squares of ground of both its ends.
+    """Return an index (n,) of each link's place: the squares of ground on which its two ends are.
 
     An obstacle beside a route shadows every flight along it, with any receiver. Further flights
     over the same ground are therefore no new evidence about a device.
@@ -54,14 +55,11 @@ def _evidence(links: Links) -> np.ndarray:
 
 
 def with_evidence(links: Links, z: np.ndarray) -> Links:
-    """Divide links into pieces of evidence as wide as a residual's correlation length.
+    """Group links whose errors are alike into pieces of evidence, which scores count as one.
 
-    Args:
-        links: n links.
-        z: (n,) residuals of the base model, divided by their scale.
-
-    Returns:
-        the links with pieces, which all later scores use, and a note if there are few.
+    A piece is a square of ground as wide as the distance over which the residuals `z` (n,) of the
+    base model (without effects), divided by their scale, are correlated. A note is added if there
+    are fewer than `FEW_SQUARES` squares.
     """
     length_m = correlation_length_m(links, z)
     width_m = evidence_width_m(links, length_m)
@@ -74,7 +72,7 @@ def with_evidence(links: Links, z: np.ndarray) -> Links:
 
 
 def evidence_width_m(links: Links, wanted_m: float, places: int = MIN_PLACES) -> float:
-    """Return the side [m] of the squares that the ground is divided into.
+    """Choose the side [m] of the squares of ground that hold one piece of evidence each.
 
     It is `wanted_m`, reduced until the moving end occupies at least `places` squares, but not below
     the median step between its positions.
@@ -92,7 +90,11 @@ def _squares_occupied(position_m: np.ndarray, width_m: float) -> int:
 
 
 def _pieces(links: Links, width_m: float, place_m: float) -> np.ndarray:
-    """Return (n, 2) indices of each link's piece of evidence and place, for given widths [m]."""
+    """Group links by squares of ground; return two group indices of each link, (n, 2).
+
+    First, links with both ends in the same squares of side `width_m`, of one device, receiver and
+    flight (a piece of evidence); then, links with both ends in those of side `place_m` (a place).
+    """
     pieces, squares = (np.column_stack([np.floor(end[:, :2] / side_m).astype(np.int64) for end in
                                         (links.receiver_m,
                                          np.nan_to_num(links.device_m[links.device]))])
@@ -103,13 +105,11 @@ def _pieces(links: Links, width_m: float, place_m: float) -> np.ndarray:
 
 
 def design_effect(block: np.ndarray, z: np.ndarray) -> float:
-    """Return the design effect: how many links count as one (Kish 1965, 'Survey sampling', 5.4).
+    """Estimate how many links count as one independent link, as errors within a block are alike.
 
-    It is the variance of block means over that of independent links, at least 1.
-
-    Args:
-        block: (n,) index of each link's block.
-        z: (n,) residuals, divided by their scale; they are clipped to `MAX_Z`.
+    It is the variance of block means, relative to that of independent links, and at least 1 (design
+    effect: Kish 1965, 'Survey sampling', 5.4). `block` (n,) is an index; `z` (n,) are residuals
+    divided by their scale, clipped to ±`MAX_Z`.
     """
     z = np.clip(z, -MAX_Z, MAX_Z)
     size = np.bincount(block)
@@ -119,10 +119,11 @@ def design_effect(block: np.ndarray, z: np.ndarray) -> float:
 
 
 def thin_piles(links: Links) -> Links:
-    """Thin the links of hovering receivers, with a note.
+    """Leave out some links of receivers that stayed at one place, with a note.
 
-    A receiver that hovers repeats one shadowing error. At each place of one device, receiver and
-    flight, at most `PILE` times the median number of links is kept, evenly in time.
+    A receiver that hovers repeats one shadowing error. At each square of `PLACE_M`, a device,
+    receiver and flight keep at most `PILE` times the median number of links (at least `MIN_PILE`),
+    evenly in time. Nothing is left out if the surplus is below `MIN_SURPLUS` of all links.
     """
     cell = np.floor(moving_end_m(links)[:, :2] / PLACE_M).astype(np.int64)
     keys = np.column_stack([cell, pair_label(links), links.flight])
@@ -142,11 +143,11 @@ def thin_piles(links: Links) -> Links:
 
 
 def thin_links(links: Links, seed: int) -> Links:
-    """Thin hovering receivers, and sample the links of a campaign that is too large, with notes.
+    """Leave out links of hovering receivers, and sample more than `MAX_LINKS` links, with notes.
 
     Links are ordered by flight, device, receiver and time, and one is drawn at random from each of
     `SAMPLE_LINKS` equal groups. Every flight, device, receiver and time keeps its share, so means
-    over the sample are unbiased.
+    over the sample are unbiased. The seed makes the sample repeatable.
     """
     links = thin_piles(links)
     n = len(links)

@@ -65,17 +65,21 @@ class CrudeLevel:
 
 def crude_level(level_db: np.ndarray, limit_db: np.ndarray, distance_m: np.ndarray,
                 device: np.ndarray, receiver: np.ndarray) -> CrudeLevel:
-    """Fit a slope over distance and a level of each device and receiver to censored levels.
+    """Predict levels by a straight line over lg distance and an offset per device and receiver.
 
-    EM for censored normal levels (Dempster, Laird and Rubin 1977, 'Maximum likelihood from
-    incomplete data via the EM algorithm', JRSS B 39, Sec. 4.2).
+    Levels that were not detected count as below the limit, by EM for censored normal levels
+    (Dempster, Laird and Rubin 1977, 'Maximum likelihood from incomplete data via the EM algorithm',
+    JRSS B 39, Sec. 4.2).
 
     Args:
         level_db: (n,) readings [dB]; NaN: not detected.
-        limit_db: (n,) limits of detection [dB]; -inf: unknown.
+        limit_db: (n,) weakest level that each receiver detects [dB]; -inf: unknown.
         distance_m: (n,) [m]; NaN: unknown.
         device: (n,) index of each link's device.
         receiver: (n,) index of each link's receiver.
+
+    Returns:
+        the predicted level of each link [dB], and the standard deviation of its error [dB].
     """
     blank = np.isnan(level_db)
     limited = blank & np.isfinite(limit_db)
@@ -147,7 +151,7 @@ class LimitEstimate:
 
 def receiver_limit(level_db: np.ndarray, mean_db: np.ndarray, scale_db: np.ndarray, as_one: float,
                    declared_db: float = -np.inf) -> LimitEstimate | None:
-    """Estimate one receiver's limit of detection; None if readings or blanks are too few.
+    """Estimate the weakest level that one receiver detects; None with few readings or blanks.
 
     Args:
         level_db: (n,) readings [dB]; NaN: not detected.
@@ -178,10 +182,12 @@ def receiver_limit(level_db: np.ndarray, mean_db: np.ndarray, scale_db: np.ndarr
 
 def _limit_nats(tried_db: np.ndarray, read_db: np.ndarray, mean_db: np.ndarray,
                 scale_db: np.ndarray, as_one: float) -> tuple[np.ndarray, float]:
-    """Return the log-likelihood [nats] of candidate limits (k,), and that of no limit.
+    """Return the log-likelihood [nats] of candidate limits of detection (k,), and of no limit.
 
-    Readings are in ascending order [dB]; `mean_db` and `scale_db` (m,) are the predictions of the
-    blanks; `as_one` is the number of links that count as one.
+    Given are the readings, ascending, and for the blanks (not detected) the predicted level
+    `mean_db` and its error `scale_db` (m,), all in dB. A blank is below the limit, or lost at any
+    level; the lost share and the width of the transition are averaged over. `as_one` links count as
+    one.
     """
     readings, blanks = len(read_db), len(mean_db)
     mean_db = np.round(mean_db / BIN_DB) * BIN_DB
@@ -203,7 +209,7 @@ def _limit_nats(tried_db: np.ndarray, read_db: np.ndarray, mean_db: np.ndarray,
 
 
 def estimate_limits(links: Links, declared_db: float | None) -> tuple[np.ndarray, list[str]]:
-    """Estimate the limit of detection of each receiver, and test a declared one.
+    """Estimate the weakest level that each receiver detects, and test the limit that is declared.
 
     Args:
         links: n links; their present limits are ignored.
@@ -244,10 +250,11 @@ def estimate_limits(links: Links, declared_db: float | None) -> tuple[np.ndarray
 
 
 def _reason_to_ignore(links: Links, declared_db: float) -> str | None:
-    """Return why a declared limit is ignored, a sentence; None if it may be right.
+    """Return why a declared limit of detection is ignored, a sentence; None if it may be right.
 
-    Received levels vary continuously: if some links are too weak, others are just strong enough. A
-    limit far below all readings is a placeholder.
+    It is ignored if at least `MIN_BLANKS` links are blank (not detected), but all readings are
+    `FAR_DB` or more above it: of levels that vary continuously, some would lie just above a real
+    limit.
     """
     readings, lowest_db = int(np.isfinite(links.level_db).sum()), _lowest_db(links.level_db)
     blanks = len(links) - readings
@@ -271,9 +278,9 @@ def _usual_db(links: Links, rows: list[np.ndarray], found: list[LimitEstimate | 
               pooled: LimitEstimate | None, declared_db: float) -> float | None:
     """Return the limit [dB] for receivers without an estimate of their own; None if unknown.
 
-    It is the declared limit, unless most estimates, or that from all links, overrule it. If none is
-    declared it is the median of the receivers with an estimate, else the estimate from all links,
-    else the lowest reading.
+    It is the declared limit, unless more than half of the receivers' sure estimates (without any:
+    the estimate from all links) overrule it. Else it is the median of these estimates, else the
+    estimate from all links, else the lowest reading.
     """
     sure = [(each, part) for each, part in zip(found, rows, strict=True) if each and each.is_sure]
     if np.isfinite(declared_db):
@@ -296,9 +303,10 @@ def contradict_limit(read_db: np.ndarray, limit_db: float) -> bool:
 
 
 def _overrules(found: LimitEstimate, read_db: np.ndarray, declared_db: float) -> bool:
-    """Return whether an estimate from readings (n,) [dB] overrules the declared limit.
+    """Return whether an estimated limit of detection is to replace the declared one.
 
-    It does not if a few readings reach down to the declared limit.
+    It is if both differ by more than their errors explain and the likelihood is clearly against the
+    declared limit, unless a few readings (n,) [dB] reach down to that.
     """
     rise_db = found.limit_db - declared_db
     off_db = max(rise_db - RISE_DB, -rise_db - FALL_DB)
@@ -309,7 +317,10 @@ def _overrules(found: LimitEstimate, read_db: np.ndarray, declared_db: float) ->
 
 def _estimates(links: Links, rows: list[np.ndarray], declared_db: float,
                ) -> tuple[list[LimitEstimate | None], LimitEstimate | None]:
-    """Return the estimate for each receiver, and that from all links."""
+    """Estimate the limit of detection of each receiver, and one limit from all links together.
+
+    `rows` are the links of each receiver. An estimate is None where readings or blanks are too few.
+    """
     blank = np.isnan(links.level_db)
     if not blank.any():
         return [None] * len(rows), None
@@ -340,7 +351,11 @@ def _lowest_db(level_db: np.ndarray) -> float:
 
 def _notes(links: Links, rows: list[np.ndarray], limits_db: np.ndarray,
            found: list[LimitEstimate | None], declared_db: float, lost: list[int]) -> list[str]:
-    """Note limits that differ from the declared one or between receivers, and lost links."""
+    """Note receivers whose limit is not the declared one, limits that differ, and lost links.
+
+    `rows` are the links of each receiver; `limits_db` and `found` its limit [dB] and the estimate,
+    if any; `lost` the receivers whose links are blank at any level.
+    """
     unit, notes = links.level_unit, []
     other = [r for r, limit_db in enumerate(limits_db)
              if np.isfinite(declared_db) and limit_db != declared_db]
@@ -372,7 +387,7 @@ def _notes(links: Links, rows: list[np.ndarray], limits_db: np.ndarray,
 
 def _used_instead(links: Links, limits_db: np.ndarray, found: list[LimitEstimate | None],
                   receivers: list[int]) -> str:
-    """Return a sentence with the limits of the first receivers that replace a declared one."""
+    """Return a sentence with the limits that replace a declared one, of `MAX_NAMED` receivers."""
     used = "; ".join(_limit_text(links.receiver_names[r], limits_db[r], found[r], links.level_unit)
                      for r in receivers[:MAX_NAMED])
     more = len(receivers) - MAX_NAMED
@@ -380,7 +395,7 @@ def _used_instead(links: Links, limits_db: np.ndarray, found: list[LimitEstimate
 
 
 def _limit_text(name: str, limit_db: float, found: LimitEstimate | None, unit: str) -> str:
-    """Return words for a receiver's limit, with half its 90 % interval if it was estimated."""
+    """Describe a receiver's limit of detection, with half its 90 % interval if it was estimated."""
     if np.isinf(limit_db):
         return f"none for {name}, as no blank shows one"
     estimated = found is not None and limit_db == found.limit_db
@@ -389,10 +404,11 @@ def _limit_text(name: str, limit_db: float, found: LimitEstimate | None, unit: s
 
 
 def limits_to_explain(links: Links) -> Links:
-    """Replace the limits of faulty receivers by the usual one, so that effects explain blanks.
+    """Give receivers that detect too little the usual limit of detection, not their own.
 
-    A faulty receiver is clearly less sensitive than most, or is blank at any level. If no limit is
-    known, the lowest reading is used for all.
+    Blanks (links not detected) above the usual limit then need another explanation, which a model
+    of faults may find. Such a receiver is clearly less sensitive than most, or has blanks at any
+    level. If no limit is known, the lowest reading is that of all receivers.
     """
     usual_db = links.usual_limit_db
     if usual_db is None:

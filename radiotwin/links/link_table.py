@@ -44,7 +44,7 @@ def links_of_frame(frame: pd.DataFrame, origin: Origin | None
     """Convert a data frame of another layout to a table of links.
 
     Receiver positions may be in any columns that a table of sites may have, such as `lat` and
-    `lon`. Without a column `flight` or `receiver`, all links are of one.
+    `lon`. Without a column `flight` or `receiver`, all links are of a flight or receiver `1`.
 
     Args:
         frame: with a level, a device and a receiver position in each row.
@@ -83,7 +83,10 @@ def links_of_frame(frame: pd.DataFrame, origin: Origin | None
 
 
 def receivers_of_frame(frame: pd.DataFrame) -> SiteTable:
-    """Read receiver positions from a data frame; BadInput: see `read_site_table`."""
+    """Read the receiver positions in a data frame of links, from columns such as `lat`, `lon`.
+
+    Columns of names, levels and devices are not searched. BadInput: see `read_site_table`.
+    """
     taken = {*NAMES, *OPTIONAL, *LEVELS} - {ABOVE_GROUND}
     others = [name for name in frame if name not in taken and not str(name).startswith("device")]
     if len(frame) and not others:

@@ -35,9 +35,10 @@ ROOF_CHUNK = 5000  # links per batch; bounds the memory of these points to 10 MB
 
 
 def clocks_restart(tracks: Tracks) -> bool:
-    """Return whether a receiver's clock restarts in each flight.
+    """Return whether the clock of any receiver starts anew in each flight.
 
-    Then its flights start at one time, or two of them put it at two places at once.
+    It does if all flights of that receiver start at the same time, or if two successive ones would
+    put it at two places at once. `tracks`: (receiver, flight) -> times [s] and positions [m].
     """
     by_receiver: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
     for (receiver, _), track in tracks.items():
@@ -47,7 +48,11 @@ def clocks_restart(tracks: Tracks) -> bool:
 
 
 def _restarts(flights: list[tuple[np.ndarray, np.ndarray]]) -> bool:
-    """Return whether the clock restarts between the flights of one receiver, sorted by start."""
+    """Return whether a receiver's clock starts anew in each of its flights, sorted by start.
+
+    A flight is its times (m,) [s] and positions (m, 3) [m]. Only flights longer than `MIN_FLIGHT_S`
+    can show it by equal starts.
+    """
     starts_s = np.array([time_s[0] for time_s, _ in flights])
     lengths_s = np.array([time_s[-1] - time_s[0] for time_s, _ in flights])
     if np.ptp(starts_s) <= SAME_START_S and (lengths_s > MIN_FLIGHT_S).all():
@@ -57,7 +62,11 @@ def _restarts(flights: list[tuple[np.ndarray, np.ndarray]]) -> bool:
 
 def _at_two_places(one: tuple[np.ndarray, np.ndarray],
                    other: tuple[np.ndarray, np.ndarray]) -> bool:
-    """Return whether two tracks of one receiver overlap in time and are at different places."""
+    """Return whether two tracks of one receiver put it at two places at the same times.
+
+    A track is times (m,) [s], ascending, and positions (m, 3) [m]. They must be more than
+    `ELSEWHERE_M` apart for a share `MIN_ELSEWHERE` of the times that both have.
+    """
     (time_s, position_m), (other_s, other_m) = one, other
     common = (time_s >= other_s[0]) & (time_s <= other_s[-1])
     if common.sum() < 2:
@@ -256,7 +265,10 @@ class Flown:
 
     @classmethod
     def of(cls, columns: Columns) -> Flown:
-        """Collect the tracks from measured links."""
+        """Collect the track (times [s] and positions [m]) of each receiver and flight from links.
+
+        Links without a time are left out; of several at one time, the first counts.
+        """
         timed = np.flatnonzero(np.isfinite(columns.time_s))
         if not len(timed):
             return cls()
@@ -396,7 +408,7 @@ class Links:
 
     @cached_property
     def declared_db(self) -> np.ndarray | float:
-        """(n,) declared power, cable, antenna and carrier in the levels [dB]; or the number 0.
+        """Part of each level that is declared, (n,) [dB]: power, cable, antennas, carrier; or 0.
 
         See `Declared.added_db`.
         """
@@ -404,10 +416,10 @@ class Links:
 
     def gains(self, declared_db: np.ndarray | float | None = None
               ) -> tuple[LinkGeometry, np.ndarray, np.ndarray]:
-        """Return the input of channel learning: ends, isotropic gains and their limits (n,) [dB].
+        """Return the input of channel learning: geometry, and isotropic gains and limits (n,) [dB].
 
-        Args:
-            declared_db: (n,) declared part that is subtracted [dB]; None: `Links.declared_db`.
+        An isotropic gain is the level without the declared part, `declared_db` (n,) [dB]: power,
+        cable and antennas (None: `Links.declared_db`).
         """
         part_db = self.declared_db if declared_db is None else declared_db
         return self.geometry, self.level_db - part_db, self.limit_db - part_db
@@ -466,7 +478,7 @@ class Links:
 
     @cached_property
     def los(self) -> np.ndarray:
-        """(n,) bool; without a map every link has line of sight."""
+        """Whether each link has line of sight, (n,) bool; without a map all have."""
         if self.known_los is not None:
             return self.known_los
         if self.city is None:
@@ -475,7 +487,11 @@ class Links:
 
     @cached_property
     def receiver_axes(self) -> np.ndarray:
-        """(n, 3, 3) unit vectors of the receiver's right, nose and top; NaN without a heading."""
+        """Unit vectors to each receiver's right, nose and top, (n, 3, 3); NaN where unknown.
+
+        They are in the local frame (east, north, up). Without any headings north is assumed; an
+        unknown pitch or roll is 0.
+        """
         heading, pitch, roll = (
             np.radians(np.zeros(len(self)) if angle is None else angle) for angle in
             (self.heading_deg, *(angle if angle is None else np.nan_to_num(angle)
@@ -496,7 +512,10 @@ class Links:
 
     @cached_property
     def diffraction_parameter(self) -> np.ndarray:
-        """(n,) largest ν over the roofs (ITU-R P.526-15, Eq. 26); NaN without a map."""
+        """Largest knife-edge parameter ν over the roofs below each link, (n,); NaN without a map.
+
+        ITU-R P.526-15, Eq. 26; it is negative if all roofs are below the straight line.
+        """
         greatest = np.full(len(self), np.nan)
         if self.city is None or np.isnan(self.frequency_hz):
             return greatest
@@ -542,7 +561,8 @@ class Links:
         """Return a copy in which the links belong to other devices, such as candidate positions.
 
         Args:
-            device: (n,) index of each link's new device; it keeps the old device's radio.
+            device: (n,) index of each link's new device, which gets the radio of the link's old
+                device.
             device_m: (k, 3) positions of the new devices [m].
             names: k names.
             anchors: indices of the new devices whose positions are declared.

@@ -188,18 +188,20 @@ class Measurements(Summarised):
 
     def moved(self, position_m: Callable[[np.ndarray], np.ndarray],
               origin: Origin | None) -> "Measurements":
-        """Move all positions to another frame.
+        """Move all positions to another frame, with that origin (None: unknown).
 
-        Args:
-            position_m: function that converts positions (n, 3) [m]; NaN: unknown.
-            origin: of the new frame; None: unknown.
+        `position_m` converts positions (n, 3) [m], in which NaN is unknown.
         """
         return replace(
             self, table=map_positions(self.table, RECEIVER_POSITION, position_m),
             devices=map_positions(self.devices, _DEVICE_POSITION, position_m), origin=origin)
 
     def on_ground(self, ground_height_m: GroundHeight | None) -> "Measurements":
-        """Convert heights above the ground to heights above the datum, see `with_datum_heights`."""
+        """Convert heights above the ground to heights above the datum of the frame.
+
+        See `with_datum_heights`. `ground_height_m` gives the ground at x, y [m]; None: it is
+        unknown.
+        """
         if "receiver_above_ground_m" not in self.table and "above_ground_m" not in self.devices:
             return self
         table, devices = (with_datum_heights(rows, name, position, ground_height_m)
@@ -222,21 +224,14 @@ class Measurements(Summarised):
 
     @classmethod
     def load(cls, path: Path | str, devices_path: Path | str | None = None) -> "Measurements":
-        """Read links and devices, see `read_measurements`.
-
-        Args:
-            path: `.csv`, `.csv.gz` or `.parquet`.
-            devices_path: table of the devices; None: `devices.csv` in the same folder.
-        """
+        """Read links and devices, see `read_measurements`."""
         return read_measurements(path, devices_path)
 
     def save(self, path: Path | str) -> None:
-        """Write the links, and the devices to `devices.csv` in the same folder.
+        """Write the links to a path, and the devices to `devices.csv` in the same folder.
 
-        A known origin goes to `frame.toml` there.
+        The path ends in `.csv`, `.csv.gz` or `.parquet`. A known origin goes to `frame.toml` there.
 
-        Args:
-            path: `.csv`, `.csv.gz` or `.parquet`.
 
         Raises:
             BadInput: `path` cannot be written, or the folder has a `devices.csv` of other devices,
@@ -303,7 +298,9 @@ class Measurements(Summarised):
         return links_dataset(self._links_with_devices(), self.origin)
 
     def to_geodataframe(self) -> "GeoDataFrame":
-        """Return the links with a point at the end that moves, in metres of the local frame.
+        """Return a GeoDataFrame of the links, as points at their moving ends in local metres.
+
+        The moving end is the receiver, or the device if devices are at more positions.
 
         Raises:
             BadInput: GeoPandas is not installed.
@@ -321,6 +318,7 @@ class Measurements(Summarised):
 
     @property
     def _summary(self) -> Summary:
+        """Describe links, receivers, devices, flights and levels for display."""
         seen = np.isfinite(self.level_db)
         known = self.level_db[seen]
         unit = "dB" if self.level_column == "gain_db" else "dBm"
@@ -427,7 +425,10 @@ def _read_devices(path: Path, origin: Origin | None,
 
 
 def _devices_of_links(table: pd.DataFrame) -> pd.DataFrame:
-    """Make the table of devices from columns `device_x_m, …` of a table of links."""
+    """Make the table of devices from columns `device_x_m, …`, by the first link of each device.
+
+    A device with a position is an anchor, others are unknown.
+    """
     first = table.drop_duplicates("device").reset_index(drop=True)
     position_m = first.reindex(columns=DEVICE_POSITION).astype(float).to_numpy()
     placed = np.isfinite(position_m[:, :2]).all(axis=1)
@@ -437,7 +438,12 @@ def _devices_of_links(table: pd.DataFrame) -> pd.DataFrame:
 
 def _devices(path: Path | str, cells: pd.DataFrame, origin: Origin | None, own: Origin | None,
              where: Callable[[int], str]) -> tuple[pd.DataFrame, tuple[str, ...]]:
-    """Convert cells of a table of sites to a table of devices, and notes; see `_read_devices`."""
+    """Make the table of devices, and notes, from the cells of a table of their positions.
+
+    Without a column `role`, devices with a position are anchors. `origin` is that of the
+    measurements' frame, `own` that of the cells' x and y; `where` gives the place of a row in the
+    file.
+    """
     sites = read_site_table(path, cells, where, "device", [*DEVICE_OPTIONAL, "antenna", "role"])
     names, values = sites.names, sites.values
     sites.refuse("device", names.duplicated(),
@@ -488,9 +494,10 @@ def read_antenna_files(path: Path, names: Iterable[str], are_rows: bool = True
 
 def _check_spread(path: Path, table: pd.DataFrame, devices_path: Path,
                   devices: pd.DataFrame) -> None:
-    """Raise BadInput about an anchor that is too far away for any link.
+    """Raise BadInput if some anchors are more than `MAX_APART_M` from the middle of the receivers.
 
-    If all anchors are, the frames differ: the scene, where there is one, is checked later.
+    An anchor is a device of declared position. If all are so far away, links and devices are in
+    different frames, which is checked later, with the scene.
     """
     middle_m = table[["receiver_x_m", "receiver_y_m"]].median().to_numpy()
     anchor = (devices["role"] == "anchor").to_numpy()

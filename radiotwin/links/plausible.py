@@ -53,7 +53,7 @@ _RANGES: dict[str, tuple[float, float, str]] = {
 
 def refuse_implausible(refuse: Callable[[np.ndarray, str], None], name: str,
                   numbers: np.ndarray) -> None:
-    """Refuse values outside the plausible range of their column, such as those in a wrong unit.
+    """Refuse values outside the plausible range of their column, as of a wrong unit.
 
     Args:
         refuse: called with a mask (n,) of bad values and the reason; raises if any is true.
@@ -91,7 +91,10 @@ def tilt_notes(tilt_deg: np.ndarray) -> list[str]:
 
 
 def high_notes(above_ground_m: np.ndarray) -> list[str]:
-    """Note heights above the ground (k,) [m] that are probably altitudes above the sea."""
+    """Note heights above the ground (k,) [m] that look like altitudes above the sea.
+
+    They do if all that are known are `HIGH_M` or more.
+    """
     known_m = above_ground_m[np.isfinite(above_ground_m)]
     if not len(known_m) or known_m.min() < HIGH_M:
         return []
@@ -109,11 +112,11 @@ def far_notes(place: np.ndarray, middle: np.ndarray, axes: tuple[str, str],
         middle: (2,) middle of the readings or of the map.
         axes: names of the two coordinates.
         where: row -> file and site, for messages.
-        what: `middle` is the middle of, such as `the readings`.
+        what: name of `middle` in messages, such as `the middle of the receivers`.
 
     Raises:
-        BadInput: the farthest site is farther away than any link is long, or a slip explains its
-            position: swapped coordinates, a wrong sign, a shifted decimal point.
+        BadInput: the farthest site is farther away than any link is long, or a typing error
+            explains its position: swapped coordinates, a wrong sign, a shifted decimal point.
     """
     apart_m = _distance_m(place, middle, axes)
     far = np.flatnonzero(apart_m > FAR_M)  # not of NaN
@@ -130,10 +133,11 @@ def far_notes(place: np.ndarray, middle: np.ndarray, axes: tuple[str, str],
 
 
 def _slip(place: np.ndarray, middle: np.ndarray, axes: tuple[str, str]) -> str:
-    """Return the slip that explains a far position (2,), as a question; `""` if none does.
+    """Guess which typing error put a position (2,) too far away, as a question; `""` if none.
 
-    Slips of the decimal point are not tried around the origin of a local frame: dividing any x and
-    y by ten often enough would bring them there.
+    Tried are swapped coordinates, wrong signs and shifted decimal points: an error is found if its
+    correction lies within `FAR_M` of `middle` (2,). Around the origin of a local frame nothing is
+    tried, as dividing any x and y by ten often enough would bring them there.
     """
     if "latitude" not in axes and np.linalg.norm(middle) <= FAR_M:
         return ""
@@ -160,9 +164,9 @@ def _distance_m(place: np.ndarray, middle: np.ndarray, axes: tuple[str, str]) ->
 
 
 def distances_m(place_deg: np.ndarray, middle_deg: np.ndarray) -> np.ndarray:
-    """Return great-circle distances (k,) [m] of latitudes and longitudes (k, 2) [deg] from one.
+    """Return great-circle distances [m] from places (k, 2) to one place (2,), latitude first [deg].
 
-    A latitude beyond 90 degrees is infinitely far away.
+    A latitude beyond 90 degrees is infinitely far away (inf).
     """
     (north, east), (middle_north, middle_east) = np.radians(place_deg).T, np.radians(middle_deg)
     chord = (np.sin((north - middle_north) / 2)**2

@@ -35,14 +35,9 @@ ASSUMED_HEIGHT_M = 1.5  # of an end without a height: a hand-held phone
 
 
 def join_links(measurements: Measurements, scene: Scene) -> Links:
-    """Join all measurements with a scene, without leaving out any.
+    """Join all measurements with a scene (map, radio, antennas), without leaving out any.
 
-    Args:
-        measurements: n links.
-        scene: gives 3D map, radio and the receivers' sensitivity.
-
-    Returns:
-        n links, with estimated limits of detection; x and y of unknown devices are NaN.
+    The links have estimated limits of detection; x and y of unknown devices are NaN.
 
     Raises:
         BadInput: measurements and scene are in different frames, or most receivers off the map.
@@ -68,9 +63,9 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
     Args:
         measurements: links.
         scene: gives 3D map and radio; None: no map, and every link has line of sight.
-        to_locate: prepare for locating devices, not for learning. Unknown devices without a scene,
-            few links, and receivers that detected nothing are kept then, as they constrain
-            positions.
+        to_locate: prepare for locating devices, not for learning. Then devices of unknown position,
+            few links, and receivers that detected nothing are kept, as they tell where a device can
+            be.
 
     Returns:
         the usable links; their `notes` say what was left out or odd, a sentence each.
@@ -153,9 +148,10 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
 
 def _clearance_m(declared_z_m: np.ndarray, device_m: np.ndarray, receiver_m: np.ndarray,
                  scene: Scene | None) -> np.ndarray:
-    """Return heights (k,) [m] of devices above the ground; without a map above the lowest receiver.
+    """Return the heights (k,) [m] of devices above the ground, to find altitudes given as heights.
 
-    NaN if the height, or the position over a map, is not declared.
+    Without a map, they are above the lowest receiver or z = 0, whichever is higher. NaN if a
+    device's height is not declared.
     """
     if scene is not None:
         return declared_z_m - _ground_m(scene, device_m, receiver_m)
@@ -181,9 +177,11 @@ def _ground_m(scene: Scene, device_m: np.ndarray, receiver_m: np.ndarray) -> np.
 def _join(measurements: Measurements, table: pd.DataFrame, scene: Scene | None,
           level_db: np.ndarray, receiver_m: np.ndarray, device_m: np.ndarray, device: np.ndarray,
           kept_devices: np.ndarray, notes: list[str]) -> Links:
-    """Make links from n selected rows and k selected devices, and estimate their limits.
+    """Make the links of n measurements and k devices, with radios and limits of detection.
 
-    `kept_devices` (k,) are rows of `measurements.devices`, and `device` (n,) are indices of these.
+    `table`, `level_db`, `receiver_m` and `device` are those of the n links, `device` (n,) an index
+    of `device_m` (k, 3); `kept_devices` (k,) are rows of `measurements.devices`. Notes are added to
+    `notes` in place.
     """
     receiver, receiver_names = pd.factorize(table["receiver"], sort=True)
     flight, flight_names = pd.factorize(table["flight"])
@@ -240,7 +238,7 @@ def _frequency_hz(measurements: Measurements, scene: Scene | None) -> float:
 
 
 def _other_frequencies(declared_hz: np.ndarray, frequency_hz: float) -> list[str]:
-    """Note devices (k,) whose declared frequency differs from that of the predictions."""
+    """Note that devices (k,) declare another frequency than that of the predictions."""
     other = np.abs(declared_hz / frequency_hz - 1) > MAX_FREQUENCY_OFF
     if not other.any():
         return []

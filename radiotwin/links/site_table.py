@@ -164,9 +164,10 @@ class _Known:
 
 @cache
 def _known_names(projected: bool) -> dict[str, _Known]:
-    """Return the meaning of all known column names; `convert` is None if the unit is missing.
+    """Return the known column names of a table of sites, each with its quantity and unit.
 
-    With `projected`, names of projected coordinates such as `easting` are included.
+    `convert` of an entry turns its numbers into the quantity's unit; it is None if the name has no
+    unit. With `projected`, names of projected coordinates such as `easting` are included.
     """
     found: dict[str, _Known] = {}
 
@@ -211,7 +212,10 @@ def misspelt(name: str, known: Iterable[str]) -> str | None:
 
 
 def _edits(one: str, other: str) -> int:
-    """Count the letters to add, drop, replace or swap between two words (Damerau 1964)."""
+    """Count the edits from one word to another: letters added, dropped, replaced, swapped.
+
+    Only neighbouring letters are swapped (Damerau 1964).
+    """
     before: list[int] = []
     last, row = before, list(range(len(other) + 1))
     for i, letter in enumerate(one, start=1):
@@ -259,12 +263,14 @@ class SiteTable:
                            + (f" ({len(rows)} such rows)" if len(rows) > 1 else ""))
 
     def local_m(self, origin: Origin | None, own: Origin | None, what: str) -> np.ndarray:
-        """Return positions (k, 3) [m] in a local frame; NaN: empty, or z is above the ground.
+        """Return positions (k, 3) [m] in a local frame; NaN: unknown.
+
+        A height above the ground is no z: it stays NaN.
 
         Args:
             origin: of the target frame; None: unknown.
-            own: origin of the frame of the columns x and y; None: the target frame.
-            what: the target frame belongs to, for messages.
+            own: origin of the frame in which the columns x and y are; None: the target frame.
+            what: owner of the target frame, for messages.
 
         Raises:
             BadInput: latitudes without an origin, or x, y that contradict latitude and longitude.
@@ -305,8 +311,8 @@ def read_site_table(path: Path | str, cells: pd.DataFrame, where: Callable[[int]
         where: index of a row -> its place in the file, for messages.
         end: kind of the sites, `device` or `receiver`; None: points without names.
         uses: quantities that the command uses besides positions.
-        length_unit: of length columns whose name has no unit; `""`: they are refused; None: as
-            `""`, for a command without such a setting.
+        length_unit: of length columns whose name has no unit. `""`: such a column is refused, with
+            advice to give the setting; None: refused without, as the command has no such setting.
         crs: whether x and y are of a projected system, in its unit.
         prefers_globe: ignore x and y if latitude and longitude are given.
         names: expected names; they decide between several columns of names.
@@ -363,7 +369,7 @@ def is_site_table(header: Iterable[str]) -> bool:
 
 def unused_columns(path: Path | str, header: Iterable[str], used: Collection[str],
                    known: Collection[str]) -> list[str]:
-    """Note the unused columns of a table with fixed column names.
+    """Note the columns of a table that are not used, where the names of columns are fixed.
 
     Raises:
         BadInput: an unused column is nearly a known name that the table lacks.
@@ -379,7 +385,7 @@ def unused_columns(path: Path | str, header: Iterable[str], used: Collection[str
 
 
 def _unused_note(path: Path | str, unused: Mapping[str, str]) -> list[str]:
-    """Note unused columns, with the reason if there is one."""
+    """Make a note of unused columns (name -> reason, or `""`); no note if there are none."""
     if not unused:
         return []
     reasons = {name: why or next((why for word, why in _UNUSED.items() if re.fullmatch(
@@ -390,7 +396,11 @@ def _unused_note(path: Path | str, unused: Mapping[str, str]) -> list[str]:
 
 
 def _redundant_position(given: Collection[str], crs: bool, prefers_globe: bool) -> tuple[str, ...]:
-    """Return the coordinates to ignore if a table has both latitude, longitude and x, y."""
+    """Return the coordinates to ignore in a table that has both latitude, longitude and x, y.
+
+    With a reference system (`crs`) of x and y these count; else `prefers_globe` decides for
+    latitude and longitude. Without either both pairs are used.
+    """
     if not {"latitude", "x"} <= set(given) or not (crs or prefers_globe):
         return ()
     pair = ("latitude", "longitude") if crs else ("x", "y")
@@ -399,7 +409,10 @@ def _redundant_position(given: Collection[str], crs: bool, prefers_globe: bool) 
 
 def _columns(path: Path | str, header: Sequence[str],
              crs: bool) -> tuple[dict[str, str], dict[str, str]]:
-    """Return the column of each quantity, and the unused columns with the reason."""
+    """Assign columns to quantities by their names; return also unused columns -> reason or `""`.
+
+    BadInput: a column holds a part of an angle, or its name is nearly a known one.
+    """
     known = _known_names(crs)
     by_rank = sorted((name for name in header if _plain(name) in known),
                      key=lambda name: known[_plain(name)].rank)
@@ -429,7 +442,12 @@ def _columns(path: Path | str, header: Sequence[str],
 
 def _name_column(path: Path | str, cells: pd.DataFrame, end: str, names: Collection[str],
                  taken: set[str]) -> tuple[str, dict[str, str]]:
-    """Return the column of the sites' names, and further columns of names with the reason."""
+    """Find the column with the names of the sites; BadInput if there is none.
+
+    Of several, the one called `end` (`device` or `receiver`) counts, else that with most of the
+    expected `names`. Columns in `taken` hold other quantities. Also returned are the other columns
+    that look like names -> why they are not used.
+    """
     words = _words(_NAMES[end])
     found = sorted((name for name in map(str, cells)
                     if _plain(name) in words and name not in taken),
@@ -444,7 +462,7 @@ def _name_column(path: Path | str, cells: pd.DataFrame, end: str, names: Collect
 
 def _numbers(table: SiteTable, quantity: str, convert: Convert | None, length_unit: str | None,
              crs: bool) -> np.ndarray:
-    """Convert the cells of a quantity to numbers (k,) in its unit; NaN: empty."""
+    """Convert cells of a quantity to numbers (k,) in its unit; NaN: empty. Else BadInput."""
     name = table.columns[quantity]
     cells = table.cells[name]
     if cells.dtype.kind in "fiu":
@@ -497,10 +515,11 @@ def _numbers(table: SiteTable, quantity: str, convert: Convert | None, length_un
 
 
 def _number_with_unit(text: str, name: str, quantity: str, crs: bool) -> tuple[float, float]:
-    """Read a cell with a unit, such as `30 m`, `100'`, `20 W`; NaN, NaN if that fails.
+    """Read a cell with a unit, such as `30 m`, `100'`, `20 W`, as one of two numbers.
 
-    Returns the number in the quantity's unit, or NaN and the number in the unit of the column's
-    name if the cell repeats that.
+    The first is in the quantity's unit. If the column's name has the same unit as the cell, it is
+    NaN, and the second is the number as written. Both are NaN for an unreadable cell or another
+    unit.
     """
     found = _WITH_UNIT.fullmatch(text) if len(text) <= _DMS_CHARACTERS else None
     nothing = (np.nan, np.nan)
@@ -517,7 +536,7 @@ def _number_with_unit(text: str, name: str, quantity: str, crs: bool) -> tuple[f
 
 
 def _without_blank_rows(cells: pd.DataFrame, key: str) -> pd.DataFrame:
-    """Drop rows that are empty in all columns, as at the end of a sheet."""
+    """Drop rows that are empty in all columns, also in that of the names, `key`."""
     nameless = cells[(as_text(cells[key]) == "").to_numpy()]
     if nameless.empty:
         return cells

@@ -46,9 +46,10 @@ def site_of(links: Links, device: int) -> list[int]:
 
 
 def antenna_of(links: Links, device: int) -> list[int]:
-    """Return a device and those on its mast with the same declared azimuth, ascending.
+    """Return a device and the devices on its mast that point the same way, ascending.
 
-    They are carriers of one antenna, or of antennas side by side.
+    Directions are declared azimuths, equal within `SAME_DIRECTION_DEG` of any member. Such devices
+    are carriers of one antenna, or of antennas side by side.
     """
     found, mast = {device}, np.array(site_of(links, device))
     for _ in mast:  # neighbours of a member are members, so that the groups of a mast are disjoint
@@ -61,7 +62,8 @@ def antenna_of(links: Links, device: int) -> list[int]:
 def relatives_of(links: Links, device: int, heard: set[int]) -> list[int]:
     """Return up to `MAX_RELATIVES` detected devices with nearly the same paths as a given device.
 
-    They are the other devices of its antenna, else of its mast; `heard` are the detected ones.
+    They are the other devices of its antenna; if none of these was detected, those of its mast.
+    `heard` are the indices of detected devices.
     """
     others = ([other for other in group if other != device and other in heard]
               for group in (antenna_of(links, device), site_of(links, device)))
@@ -82,7 +84,10 @@ class Repeats:
 
     @classmethod
     def of(cls, links: Links, *same: np.ndarray) -> Repeats:
-        """Group readings by device, receiver and further labels (n, …), and sum their squares."""
+        """Sum the squared scatter [dB²] of detected readings that should be equal, for each device.
+
+        They should be equal if device, receiver and further labels (n, …) are.
+        """
         seen = np.isfinite(links.level_db)
         label = np.column_stack([links.device, links.receiver, *same])[seen]
         group = np.unique(label, axis=0, return_inverse=True)[1].ravel()
@@ -108,10 +113,11 @@ def repeats_at_places(links: Links) -> Repeats:
 
 
 def shared_names(links: Links) -> dict[int, str]:
-    """Find devices that may be two transmitters with one name, such as carriers of a cell.
+    """Find devices that may be two transmitters with one name, such as two carriers of a cell.
 
-    A receiver then reads two levels at one time, or at one place, which scatter more than those of
-    other devices.
+    A receiver then reads two levels at one time, or at one place. A device is found if such
+    repeated readings scatter by more than `SHARED_DB`, and by `SHARED_RATIO` times as much as
+    usual.
 
     Returns:
         device index -> the reason, for a note.
@@ -132,14 +138,10 @@ def shared_names(links: Links) -> dict[int, str]:
 
 
 def inseparable_pairs(one: np.ndarray, other: np.ndarray) -> dict[int, int]:
-    """Find pairs of labels with exactly the same links, whose errors cannot be separated.
+    """Find pairs of labels with exactly the same links: their errors cannot be told apart.
 
-    Args:
-        one: (n,) label of each link, such as its device.
-        other: (n,) another label, such as its receiver or flight.
-
-    Returns:
-        label of the first kind -> label of the second.
+    `one` and `other` (n,) are labels of links, such as device and receiver. Returned is a
+    dictionary: label of `one` -> label of `other`.
     """
     code, links = np.unique(one * (int(other.max(initial=0)) + 1) + other, return_counts=True)
     first, second = np.divmod(code, int(other.max(initial=0)) + 1)
@@ -148,10 +150,10 @@ def inseparable_pairs(one: np.ndarray, other: np.ndarray) -> dict[int, int]:
 
 
 def inseparable_end(links: Links, end: str, members: set[int]) -> str | None:
-    """Return the other end (device or receiver) if a member shares all its links with one there.
+    """Return the other end (device or receiver) if a member has all links with one member there.
 
-    The errors of the two cannot be separated. `members` are indices at `end`; only detected links
-    count. None: all errors can be separated.
+    Errors of a device and a receiver with exactly the same detected links cannot be told apart.
+    `members` are indices at `end`. None: all can be told apart.
     """
     other, heard = OTHER_END[end], np.isfinite(links.level_db)
     together = inseparable_pairs(getattr(links, end)[heard], getattr(links, other)[heard])
@@ -159,7 +161,7 @@ def inseparable_end(links: Links, end: str, members: set[int]) -> str | None:
 
 
 def end_notes(links: Links) -> list[str]:
-    """Note devices that may be two transmitters, and devices with all links to one receiver."""
+    """Note devices that may be two transmitters, and those that only one receiver or flight has."""
     notes = [f"device {links.device_names[device]} may be two transmitters of one name, such as "
              f"cells of one identity or carriers of a cell: {why}; if so, give each its name"
              for device, why in shared_names(links).items()]
@@ -197,11 +199,12 @@ class ReceiverDifference:
 
 
 def receiver_differences(links: Links) -> list[ReceiverDifference]:
-    """Compare every two receivers that read the same devices at the same places.
+    """Estimate the difference of level [dB] between every two receivers at the same places.
 
     Returns:
-        the differences with at least `MIN_PAIRS` pairs at `MIN_PLACES` places. None are compared if
-        devices move, since the receivers are fixed then, or with more than `MAX_RECEIVERS`.
+        a difference for each two receivers with `MIN_PAIRS` or more pairs of readings at
+        `MIN_PLACES` or more places; empty if devices move (receivers are fixed then), or with more
+        than `MAX_RECEIVERS` receivers.
     """
     members = np.unique(links.receiver[np.isfinite(links.level_db)])
     if not 2 <= len(members) <= MAX_RECEIVERS or devices_move(links):
@@ -212,7 +215,11 @@ def receiver_differences(links: Links) -> list[ReceiverDifference]:
 
 
 def _difference(links: Links, first: int, second: int) -> ReceiverDifference | None:
-    """Compare two receivers; None if they share too few readings or places."""
+    """Estimate how much higher the second receiver reads than the first [dB], with its interval.
+
+    The medians at each place are averaged, with outliers clipped. None if the two share too few
+    readings or places.
+    """
     pairs = _pairs(links, first, second)
     if len(pairs) < MIN_PAIRS:
         return None
@@ -234,10 +241,14 @@ def _difference(links: Links, first: int, second: int) -> ReceiverDifference | N
 
 
 def _pairs(links: Links, first: int, second: int) -> pd.DataFrame:
-    """Pair each reading of the first receiver with the nearest one of the second, per device.
+    """Pair each reading of a receiver with the nearest one of another receiver, per device.
+
+    Only pairs within `SAME_M` whose mean level is `ABOVE_LIMIT_DB` or more above both limits of
+    detection count: weaker ones would be missing at the less sensitive receiver.
 
     Returns:
-        columns device, x and y of the square of ground, and the difference of levels [dB].
+        columns device, x and y of the square of ground, and the level of the second receiver minus
+        that of the first [dB].
     """
     read = np.isfinite(links.level_db)
     parts = []

@@ -15,13 +15,10 @@ NO_EDGE = -10.0  # diffraction parameter without a map: far above any edge
 
 
 def residual_variables(links: Links, mean_db: np.ndarray) -> dict[str, np.ndarray]:
-    """Compute all variables (n,) that a residual may depend on, by name.
+    """Compute every variable (n,) on which a residual may depend: name -> values.
 
-    Integers are labels without an order; NaN is unknown.
-
-    Args:
-        links: n links.
-        mean_db: (n,) predicted levels [dB].
+    `mean_db` (n,) are the predicted levels [dB]. Integers are labels without an order; NaN is
+    unknown.
     """
     return {name: variable(links, mean_db) for name, variable in VARIABLES.items()}
 
@@ -63,11 +60,9 @@ VARIABLES: dict[str, Callable[[Links, np.ndarray], np.ndarray]] = {
 
 
 def feature_count(devices: int, declared: bool) -> int:
-    """Return the number of columns of `link_features(links, receivers=False)`.
+    """Return how many columns `link_features(links, receivers=False)` gives.
 
-    Args:
-        devices: number of devices.
-        declared: whether the azimuth of any antenna is declared.
+    `declared` tells whether any azimuth is; more than `MAX_LABELS` devices get no columns.
     """
     labels = devices if 1 < devices <= MAX_LABELS else 0
     return GEOMETRY_COLUMNS + BORESIGHT_COLUMNS * declared + labels
@@ -76,11 +71,12 @@ def feature_count(devices: int, declared: bool) -> int:
 def link_features(links: Links, receivers: bool = True) -> np.ndarray:
     """Compute the inputs of a regression: geometry, angles, and one-hot device and receiver.
 
-    Times, and columns that the receiver reports beside the level, are left out: a map has none.
+    Times, and what a receiver reports beside the level, are left out, as they are unknown where a
+    map is predicted.
 
     Args:
         links: n links.
-        receivers: whether to include the receiver; the receiver of a map is none of them.
+        receivers: whether to include the receiver; a map is for a receiver that was not measured.
 
     Returns:
         (n, p): both positions [m], distance [m] and its logarithm, elevation [deg], sine and cosine

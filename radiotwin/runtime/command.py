@@ -65,7 +65,7 @@ def with_output_options(command: Callable[..., Any], prints_tables: bool) -> Cal
 
 def with_options(command: Callable[..., Any], signature: inspect.Signature,
                  added: dict[str, tuple[Any, Any]]) -> Callable[..., Any]:
-    """Declare further options of a command, in the signature and annotations that Typer reads.
+    """Declare further options of a command in its signature, which Typer reads; return the command.
 
     Args:
         command: takes all options as keywords; it is modified.
@@ -142,7 +142,10 @@ class _Output:
 
 
 def exit_status(work: Callable[[], Any], kept: str | Callable[[], str]) -> int:
-    """Run a command, print one message about an error, and return the exit status (see above).
+    """Run a command, print one message about an error, and return the process's exit status.
+
+    It is 0 (done), 1 (failed), 2 (bad input), 128 + the signal that ended it, or the work's
+    integer.
 
     With `--json` on the command line the message is also on standard output:
     `{"error": {"message": "...", "status": 2}}`.
@@ -180,7 +183,7 @@ def exit_status(work: Callable[[], Any], kept: str | Callable[[], str]) -> int:
 
 
 def _status_and_message(error: BaseException, kept: str) -> tuple[int, str]:
-    """Return the exit status and the message for an exception."""
+    """Return the exit status for an exception, and the message to print; `""`: print nothing."""
     if isinstance(error, SystemExit) and not error.code:
         return 0, ""
     number = signals.received()
@@ -210,7 +213,7 @@ def _status_and_message(error: BaseException, kept: str) -> tuple[int, str]:
 
 
 def _usage(error: Any) -> str:
-    """Return the message about wrong options or arguments; empty if the help was shown."""
+    """Return a one-line message about wrong options; `""` if the help was shown instead."""
     message = error.format_message()
     if message.startswith("Usage:"):  # a command without the arguments that it needs
         error.show()
@@ -220,7 +223,7 @@ def _usage(error: Any) -> str:
 
 
 def _unexpected(error: BaseException) -> str:
-    """Save the traceback of an unexpected error, and return a message that names its file."""
+    """Save an unexpected error's traceback to a temporary file; return a message that names it."""
     name = type(error).__name__
     said = f"unexpected error while running {_command()}: {name}{_first_line(error)}"
     try:
@@ -250,6 +253,7 @@ def _command() -> str:
 
 
 def _folder_is_gone() -> bool:
+    """Return whether the working folder does not exist any more."""
     try:
         os.getcwd()
     except OSError:

@@ -20,7 +20,7 @@ __all__ = ["List", "njit"]
 
 
 def _path_without_folder(name: str) -> list[str]:
-    """Return `sys.path` without the entries in which a name is only a folder without code."""
+    """Return `sys.path` without entries in which a name is a mere folder, no package with code."""
     found = find_spec(name) if name not in sys.modules else None
     folders: list[str] = []
     if found is not None and found.origin is None:

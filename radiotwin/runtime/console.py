@@ -109,7 +109,7 @@ def result(name: str, value: Any) -> None:
 
 
 def print_rows(title: str, columns: dict[str, str], rows: list[list]) -> None:
-    """Print a table.
+    """Print a table, and keep its rows for the document of `--json`.
 
     Args:
         title: line above it.
@@ -159,7 +159,7 @@ def progress(description: str, total: float | None, lines: bool = False,
     Args:
         description: text before the bar.
         total: number of steps; None if unknown.
-        lines: without a terminal, print a line every ten seconds.
+        lines: if standard error is no terminal, print a line every ten seconds.
 
     Yields:
         `advance(n=1, description=None)`, which adds `n` steps and may change the text.

@@ -118,7 +118,7 @@ NO_DRIVER = "there is no NVIDIA driver on this machine"
 
 @cache
 def tracing_refusal() -> str | None:
-    """Return why rays cannot be traced on a GPU, from a trial link; None if they can."""
+    """Return why rays cannot be traced on a GPU, found by tracing one link; None if they can."""
     if not has_driver():
         return NO_DRIVER
     try:
@@ -130,7 +130,7 @@ def tracing_refusal() -> str | None:
 
 @cache
 def torch_refusal() -> str | None:
-    """Return why PyTorch cannot train on a GPU, from a trial product; None if it can."""
+    """Return why PyTorch cannot train on a GPU, found by one small product; None if it can."""
     torch = optional_package("torch", "torch is not installed (`pip install 'radiotwin[nn]'`)")
     if not torch.cuda.is_available():
         return (NO_DRIVER if not has_driver() else
@@ -158,7 +158,10 @@ def torch_device(wanted: str) -> Device:
 
 
 def _device(wanted: str, work: Literal["tracing", "training"]) -> Device:
-    """Resolve the option `--device` for a kind of work, and log the reason."""
+    """Choose `cpu` or `cuda` by the option `--device`, for a kind of work, and log the reason.
+
+    `auto` takes CUDA if it works; BadInput if `cuda` is wanted and does not.
+    """
     if wanted not in DEVICES:
         raise BadInput(f"--device {wanted[:60]!r}: allowed are {', '.join(DEVICES)}"
                        + "; --devices names radios" * (work == "tracing"))
@@ -174,9 +177,9 @@ def _device(wanted: str, work: Literal["tracing", "training"]) -> Device:
 
 
 def share_of_gpu(memory_bytes: int) -> float:
-    """Return the share of a GPU for a worker that needs so much memory, with Ray's four decimals.
+    """Return the share of a GPU for a worker that needs so many bytes of its memory.
 
-    It is above 0 and at most 1; 1 if the memory is unknown (0).
+    It is 0.0001 to 1, with four decimals as Ray takes it; 1 if the memory is unknown (0).
     """
     memories = [gpu.memory_bytes for gpu in gpus()]
     if not memories or not memory_bytes:

@@ -81,10 +81,10 @@ class Executor:
             self._has_workers or time.monotonic() - self._opened_s >= self._patience_s)
 
     def run_ahead(self, job: Job[P, R], pieces: Sequence[P], cache: Cache[P, R]) -> None:
-        """Fill the cache by worker processes with results that this process will need.
+        """Compute in worker processes the results that this process will need, into the cache.
 
-        Nothing is done unless `is_worth_it`. A piece that fails is left to this process, where its
-        error shows, with a message. Arguments are those of `run`.
+        Nothing is done unless `is_worth_it`. If workers fail, a message says so, and the missing
+        results are left to this process. Arguments are those of `run`.
         """
         if self.is_worth_it:
             missing = deque(_Todo(piece, lambda result: None) for piece in pieces
@@ -133,7 +133,11 @@ class Executor:
 
     def _run_here(self, job: Job, todo: "deque[_Todo]", cache: Cache,
                   advance: Callable[..., None], patience_s: float) -> None:
-        """Run pieces in this process until these, or the rest by extrapolation, exceed a time."""
+        """Run pieces in this process, until they take longer than a worker's start is worth.
+
+        They do if the time so far, or that of the rest at the same speed, exceeds `patience_s`.
+        Pieces that are done are removed from `todo`, in place.
+        """
         first_s = total_s = 0.0
         done = 0
         while todo and (self._pool is None or max(
@@ -149,7 +153,7 @@ class Executor:
 
     def _run_there(self, job: Job, todo: "deque[_Todo]", cache: Cache,
                    advance: Callable[..., None]) -> bool:
-        """Run pieces on workers; return False if the pool has none."""
+        """Run all pieces of `todo` on workers; return False, and run none, if the pool has none."""
         assert self._pool is not None
         workers = self._pool.prepare(_pickled(job), job.resources, len(todo))
         if not workers:
@@ -212,7 +216,7 @@ class _Run(Generic[P, R]):
             raise
 
     def _collect(self, future: "Future[Outcome]", worker: Worker, one: "_Todo[P]") -> None:
-        """Store a result; retry the piece if its worker died; else raise the function's error."""
+        """Store a result; retry the piece if its worker died; raise an error of its function."""
         error = future.exception()
         if error is None:
             self._finish(one, future.result())
@@ -229,7 +233,7 @@ class _Run(Generic[P, R]):
         self._advance(self._job.size(one.piece))
 
     def _show(self, outcome: Outcome) -> None:
-        """Repeat the warnings and log records of a worker, each text once."""
+        """Show the warnings and log records of a worker in this process, each text once."""
         for message in outcome.messages:
             if message not in self._shown:
                 self._shown.add(message)
@@ -241,7 +245,7 @@ class _Run(Generic[P, R]):
                 logging.getLogger(name).log(level, "%s", text)
 
     def _retry(self, one: "_Todo[P]", death: Death) -> None:
-        """Retry a piece after its worker died: as a whole, then in halves; else raise RunFailed."""
+        """Run a piece again whose worker died, as a whole, then in halves; or raise RunFailed."""
         one.deaths += 1
         if not death.memory and one.deaths <= RETRIES:
             self._todo.appendleft(one)
@@ -273,7 +277,7 @@ class _Run(Generic[P, R]):
                 self._todo.appendleft(_Todo(half, joined(place), is_half=True))
 
     def _advice(self) -> str:
-        """Return the end of a message about a piece that cannot be run."""
+        """Return what to do about a piece that cannot be run, as the end of a message."""
         resources = self._job.resources
         if not resources.memory_bytes:
             return "Run it with fewer workers, or on a machine with more memory"
@@ -323,7 +327,11 @@ class LocalPool(Pool):
         self._workers: list[_LocalWorker] = []
 
     def prepare(self, function: bytes, resources: Resources, count: int) -> Sequence[Worker]:
-        """Return workers for a job, at most `count`; running ones are used again."""
+        """Return workers for a job, at most `count`; running ones are used again, others ended.
+
+        Empty if fewer than two would be chosen automatically; RunFailed if a requested number does
+        not fit.
+        """
         room, on_gpu = self.room(resources), _room_on_gpu(resources)
         wanted = min(self._most or min(room, on_gpu, _cores() // resources.cores), count)
         if self._most is None and wanted < 2:
@@ -347,7 +355,7 @@ class LocalPool(Pool):
         return self._workers
 
     def room(self, resources: Resources) -> int:
-        """Return how many workers fit into memory; the number of cores if that is unknown."""
+        """Return how many workers fit into free memory; as many as cores if memory is unknown."""
         free = free_memory_bytes()
         if free is None or not resources.memory_bytes:
             return max(self._most or 0, _cores() // resources.cores)
@@ -403,6 +411,7 @@ class _LocalWorker(Worker):
         return resident_bytes(self._begun.result()) if begun else 0
 
     def submit(self, piece: Any) -> "Future[Outcome]":
+        """Run a piece in the worker's process, started if needed; send a new function with it."""
         if self._pool is None:
             self._start()
         if self._sent == self.function:
@@ -415,6 +424,7 @@ class _LocalWorker(Worker):
         self._pool, self._begun = start_process(thread_variables(self.resources.cores))
 
     def death(self, error: BaseException) -> Death | None:
+        """Return why the process died, if an error means that; None: an error of the function."""
         import loky
 
         if not isinstance(error, loky.process_executor.TerminatedWorkerError):

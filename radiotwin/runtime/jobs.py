@@ -109,7 +109,7 @@ class PieceRunner:
         self._function: Callable[[Any], Any] | None = None
 
     def run(self, piece: Any, function: bytes | None = None) -> Outcome:
-        """Run a piece; a pickled function replaces the present one first."""
+        """Run the function on a piece; if given, a pickled function replaces the present one."""
         if function is not None:
             self._function = None  # frees its memory first
             self._function = pickle.loads(function)  # sent by the process that started this one
@@ -138,7 +138,7 @@ def begin_worker(parent: int) -> int:
 
 
 def peak_bytes() -> int:
-    """Return the peak memory of this process; 0 if unknown."""
+    """Return the largest memory that this process has had [bytes]; 0 if unknown."""
     if os.name != "posix":
         return 0
     import resource
@@ -154,7 +154,7 @@ def thread_variables(cores: int) -> dict[str, str]:
 
 @contextmanager
 def _noted(outcome: Outcome) -> Iterator[None]:
-    """Collect warnings and log records of the block in an outcome."""
+    """Collect the warnings and log records of the block in an outcome, in place."""
     handler = _Noting(outcome)
     root = logging.getLogger()
     root.addHandler(handler)

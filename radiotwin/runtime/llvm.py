@@ -68,7 +68,7 @@ def _version_in_name(name: str) -> tuple[int, ...] | None:
 
 @cache
 def reported_version(path: Path) -> tuple[int, ...] | str:
-    """Return the version that a library reports, or the reason why it reports none.
+    """Return the version that a libLLVM reports, or the reason why it reports none, as a text.
 
     Versions below 16 cannot report it.
     """
@@ -129,7 +129,7 @@ def find() -> list[Candidate]:
 
 
 def rejection(candidate: Candidate) -> str | None:
-    """Return the reason why a library cannot be used; None if it can."""
+    """Return the reason why a libLLVM cannot be used; None if it can."""
     too_old = f"too old: Dr.Jit needs version {MIN_VERSION} or newer"
     if candidate.version is not None and candidate.version[0] < MIN_VERSION:
         return too_old
@@ -140,7 +140,7 @@ def rejection(candidate: Candidate) -> str | None:
 
 
 def _eligible() -> list[Candidate]:
-    """Return the candidates; only the one in DRJIT_LIBLLVM_PATH if that is set, as Dr.Jit does."""
+    """Return the libraries that may be used: that in DRJIT_LIBLLVM_PATH if set, else all found."""
     candidates = find()
     if not os.environ.get(VARIABLE):
         return candidates

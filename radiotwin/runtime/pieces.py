@@ -44,7 +44,7 @@ _DAMAGE = (BadInput, OSError, ValueError, KeyError, TypeError, IndexError, Attri
 
 
 def pieces_folder() -> Path:
-    """Return the folder of the parts: in `RADIOTWIN_CACHE`, or in the user's cache folder."""
+    """Return the folder of cached results: in `RADIOTWIN_CACHE`, or in the user's cache folder."""
     if given := os.environ.get("RADIOTWIN_CACHE"):
         return Path(given) / "pieces"
     caches = os.environ.get("XDG_CACHE_HOME")
@@ -97,7 +97,7 @@ class PieceStore:
         return value
 
     def put(self, name: str, piece: Piece, messages: list[str]) -> None:
-        """Write a part; on failure, warn once and write no more."""
+        """Write a part (a cached result) to a file; on failure, warn once and write no more."""
         if self.failed:
             return
         data = _encode(piece[0], [piece[1], messages])
@@ -181,13 +181,9 @@ _stores: list[PieceStore] = []  # the last one is in use
 
 @contextmanager
 def keep_pieces(folder: Path | None = None) -> Iterator[PieceStore]:
-    """Cache finished parts of the work in the block, and use those of earlier runs.
+    """Cache results of the block in a folder, and use those of earlier runs; yield the store.
 
-    Args:
-        folder: of the parts; None: `pieces_folder`.
-
-    Yields:
-        the store, with its counts.
+    A part is the result of one call. `folder` None: `pieces_folder`.
     """
     store = PieceStore(pieces_folder() if folder is None else folder)
     _stores.append(store)
@@ -221,7 +217,7 @@ def keeps() -> bool:
 
 def kept(kind: str, inputs: tuple, make: Callable[[], T], pack: Callable[[T], Piece | None],
          unpack: Callable[[dict[str, np.ndarray], Any], T]) -> T:
-    """Return the result of a function, from the cache if it is there.
+    """Return the result of `make()`, from the cache if it is there.
 
     Args:
         kind: of the part; letters, digits and dashes.
@@ -236,7 +232,7 @@ def kept(kind: str, inputs: tuple, make: Callable[[], T], pack: Callable[[T], Pi
 def kept_with_name(kind: str, inputs: tuple, make: Callable[[], T],
                    pack: Callable[[T], Piece | None],
                    unpack: Callable[[dict[str, np.ndarray], Any], T]) -> tuple[T, str]:
-    """Return the result of a function like `kept`, and the part's name; `""` if not cached."""
+    """Return the result of `make()` like `kept`, and its name in the cache; `""` if not cached."""
     parts: KeptParts[None, T] = KeptParts(kind, lambda _: inputs, pack, unpack)
     name = parts.name(None)
     if not name:
@@ -266,7 +262,7 @@ class KeptParts(Generic[P, T]):
     unpack: Callable[[dict[str, np.ndarray], Any], T]
 
     def name(self, piece: P) -> str:
-        """Return the name of a piece's part; "" without a cache, or if its inputs have no hash."""
+        """Return a result's name in the cache, from a hash of its inputs; `""`: it has none."""
         if not _stores:
             return ""
         try:
@@ -286,7 +282,7 @@ class KeptParts(Generic[P, T]):
             self.keep(name, value, messages, seconds)
 
     def find(self, name: str) -> tuple[T] | None:
-        """Return the part with a name, like `get`."""
+        """Return the cached result of a name, in a tuple, or None; repeat its warnings once."""
         store = _stores[-1]
         found = store.get(name, self.unpack)
         if found is None:
@@ -302,7 +298,7 @@ class KeptParts(Generic[P, T]):
         return (value,)
 
     def keep(self, name: str, value: T, messages: list[str], seconds: float) -> None:
-        """Store the part under a name, like `put`."""
+        """Cache a result under a name if it took `MIN_SECONDS` or more, and can be packed."""
         store = _stores[-1]
         store.shown.update(messages)
         store.made += 1
@@ -314,7 +310,7 @@ class KeptParts(Generic[P, T]):
 
 @cache
 def versions() -> tuple[str, ...]:
-    """Return the versions of the libraries, and the hash of this package's sources."""
+    """Return the versions of Python and libraries, and the hash of this package's sources."""
     from importlib.metadata import PackageNotFoundError, version
 
     found = [platform.python_version(), platform.machine()]
@@ -331,7 +327,7 @@ def versions() -> tuple[str, ...]:
 
 @contextmanager
 def noted_warnings() -> Iterator[list[str]]:
-    """Collect the texts of UserWarnings of the block, which are shown as well."""
+    """Collect the texts of UserWarnings that the block raises; they are shown as well."""
     # `warnings.catch_warnings` would forget which ones were shown before.
     show, messages = warnings.showwarning, list[str]()
 
@@ -355,7 +351,7 @@ def _encode(arrays: dict[str, np.ndarray], content: Any) -> bytes:
 
 
 def _decode(data: bytes) -> Piece:
-    """Decode a part without running code; errors (`_DAMAGE`) mean that it is damaged."""
+    """Decode a cached result without running code; errors (`_DAMAGE`) mean that it is damaged."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:  # its sizes are claims
         PIECE_BYTES.check(sum(entry.file_size for entry in archive.infolist()), "part")
         if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):

@@ -40,7 +40,7 @@ def _watch(parent: int) -> None:
 
 
 def free_memory_bytes() -> int | None:
-    """Return the memory that can be allocated without swapping; None if unknown.
+    """Return the memory [bytes] that can be allocated without swapping; None if unknown.
 
     It is the smaller of the machine's free memory and the rest of this process's control group.
     """
@@ -49,7 +49,7 @@ def free_memory_bytes() -> int | None:
 
 
 def _machine_bytes() -> int | None:
-    """Return the available memory of the machine; on macOS all memory; None if unknown."""
+    """Return the available memory of the machine [bytes]; on macOS all of it; None: unknown."""
     with suppress(OSError, ValueError, IndexError):
         for line in Path("/proc/meminfo").read_text().splitlines():
             if line.startswith("MemAvailable:"):
@@ -60,7 +60,7 @@ def _machine_bytes() -> int | None:
 
 
 def _group_bytes() -> int | None:
-    """Return the free memory of a container: control groups of version 2, then 1.
+    """Return the free memory [bytes] of a container's control group (version 2, else 1), or None.
 
     File pages that were not used lately are counted as used there, but can be freed.
     """
@@ -110,7 +110,7 @@ def thread_count() -> int:
 
 
 def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """Call a function with each item, in threads; return the results in the order of the items.
+    """Call a function with each item, in several threads; return the results in their order.
 
     The function must be thread-safe. A progress bar in it needs an outer one around the call.
     """

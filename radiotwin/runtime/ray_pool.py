@@ -132,7 +132,7 @@ class RayPool(Pool):
                     "the same on all, or results would differ")
 
     def prepare(self, function: bytes, resources: Resources, count: int) -> Sequence[Worker]:
-        """Return workers for a job; RunFailed if the cluster has no room for the requested ones."""
+        """Return workers for a job, at most `count`; RunFailed if the cluster has no room."""
         wanted = min(self._capacity(resources), count)
         same = [each for each in self._workers if each.resources == resources][:wanted]
         for each in self._workers:
@@ -146,7 +146,10 @@ class RayPool(Pool):
         return self._workers
 
     def _capacity(self, resources: Resources) -> int:
-        """Return the number of workers to start; RunFailed if they do not fit on the cluster."""
+        """Return how many workers to start: as many as asked for, else as fit on the cluster.
+
+        RunFailed if they do not fit.
+        """
         nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
         needs = {"CPU": resources.cores, "memory": resources.memory_bytes,
                  "GPU": resources.gpu_share}
@@ -219,6 +222,7 @@ class _RayWorker(Worker):
         self._actor: Any = None
 
     def submit(self, piece: Any) -> "Future[Outcome]":
+        """Run a piece in the worker's process, started if needed; send a new function with it."""
         if self._actor is None:
             resources = self.resources
             self._actor = self._ray.remote(PieceRunner).options(
@@ -232,6 +236,7 @@ class _RayWorker(Worker):
         return self._actor.run.remote(piece, self.function).future()
 
     def death(self, error: BaseException) -> Death | None:
+        """Return why the process died, if an error means that; None: an error of the function."""
         exceptions = self._ray.exceptions
         if isinstance(error, exceptions.OutOfMemoryError):
             self.close()
@@ -256,7 +261,7 @@ class _RayWorker(Worker):
 
 @contextlib.contextmanager
 def _own_handlers() -> Iterator[None]:
-    """Restore the handler of SIGTERM, which Ray replaces."""
+    """Restore this program's handler of SIGTERM after the block, in which Ray replaces it."""
     before = signal.getsignal(signal.SIGTERM)
     try:
         yield
@@ -271,7 +276,7 @@ def _versions() -> tuple[str, ...]:
 
 
 def _require_token() -> None:
-    """Set the environment of our own cluster, with a token; without one it would run any code."""
+    """Set the environment of our own Ray cluster, with a token that keeps strangers out."""
     if any(os.environ.get(name) != value for name, value in _OF_OWN_CLUSTER.items()):
         if "ray" in sys.modules:
             raise BadInput("--cluster auto: this process imported Ray before its token was set; "

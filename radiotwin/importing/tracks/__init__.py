@@ -25,7 +25,7 @@ _READERS = {".gpx": read_gpx, ".kml": read_kml, ".nmea": read_nmea, ".nma": read
 
 def add_tracks(source: Source, links: pd.DataFrame, settings: Settings,
                tally: Tally) -> tuple[pd.DataFrame, list[str]]:
-    """Fill in missing receiver positions of links from tracks; count and drop the rest.
+    """Fill in missing receiver positions of links from tracks; drop and count links without.
 
     Returns:
         links with `latitude, longitude, altitude` and, if a track has them, angles; and notes.
@@ -71,7 +71,7 @@ def add_tracks(source: Source, links: pd.DataFrame, settings: Settings,
 
 
 def _read(track: TrackFile, zone: str | None) -> Fixes:
-    """Read a track with the reader of its format."""
+    """Read a track with the reader for its format, found by the file's name and beginning."""
     path = Path(track.file)
     if is_rosbag(path):
         return read_rosbag(path, track.topic)

@@ -87,7 +87,7 @@ def read_dataflash(path: Path) -> Fixes:
 
 
 def _nearest(attitude: np.ndarray, clock_s: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the angles (n,) [deg] of an attitude (m, 4) at the nearest times."""
+    """Return roll, pitch and yaw (n,) [deg] at the nearest times, of rows (m, 4): time, angles."""
     if not len(attitude):
         return {}
     after = np.searchsorted(attitude[:, 0], clock_s).clip(0, len(attitude) - 1)
@@ -145,7 +145,7 @@ def _text_messages(content: bytes) -> Iterator[tuple[str, dict[str, float]]]:
 
 
 def read_tlog(path: Path) -> Fixes:
-    """Read the track of the vehicle with most positions in a telemetry log; BadInput if none."""
+    """Read a MAVLink telemetry log: the track of the vehicle with most positions; or BadInput."""
     positions: dict[int, list[list[float]]] = {}
     attitudes: dict[int, list[list[float]]] = {}
     damaged = 0
@@ -175,7 +175,7 @@ def read_tlog(path: Path) -> Fixes:
 
 
 def _packets(content: bytes) -> Iterator[tuple[float, int, int, bytes | None]]:
-    """Yield time [s], vehicle, message and content (None if damaged) of the needed packets."""
+    """Yield time [s], vehicle, message number and body of needed packets; damaged: body None."""
     at = 0
     while at + 16 < len(content):
         magic, length = content[at + 8], content[at + 9]
@@ -212,7 +212,7 @@ def _checksum(data: bytes) -> int:
 
 
 def _needed_messages(path: Path, topics: Collection[str]) -> io.BytesIO:
-    """Copy the formats, subscriptions and data of some topics from a ULog, up to a truncation."""
+    """Copy what concerns some topics from a PX4 log (ULog), up to where it is cut off."""
     result = io.BytesIO()
     subscribed: set[bytes] = set()
     count = 0
@@ -249,7 +249,7 @@ def _needed_messages(path: Path, topics: Collection[str]) -> io.BytesIO:
 
 
 def _check_fields(path: Path, name: str, fields: str) -> None:
-    """Raise BadInput about nested fields, and arrays that are too large for a message."""
+    """Raise BadInput if a topic of a PX4 log has nested fields, or arrays that are too large."""
     found = [_FIELD.fullmatch(field) for field in fields.rstrip(";").split(";")]
     if not all(found) or sum(int(each[1] or 1) for each in found if each) > _MAX_BODY:
         raise BadInput(f"{path}: its topic {name} has an unusual format; convert its position to "
@@ -281,6 +281,7 @@ def read_ulog(path: Path) -> Fixes:
 
 
 def _fixes(path: Path, topics: dict[str, Any]) -> Fixes:
+    """Return the positions of a PX4 log: estimated ones, else of the GNSS receiver; with angles."""
     gps = next((topics[name] for name in _GPS if name in topics), None)
     if gps is None:
         raise BadInput(f"{path} has no GNSS position ({' or '.join(_GPS)}), without which its "

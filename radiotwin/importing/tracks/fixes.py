@@ -58,7 +58,9 @@ class Fixes:
 
 def make_fixes(source: object, time_s: np.ndarray, values: dict[str, np.ndarray],
                notes: tuple[str, ...] = ()) -> Fixes:
-    """Sort positions by time (n,) [s since 1970 UTC], and keep the last one of each time.
+    """Sort positions by time (n,) [s since 1970 UTC]; of several at one time the last counts.
+
+    Positions that are unknown or 0, 0 are left out; impossible altitudes become NaN, with a note.
 
     Raises:
         BadInput: fewer than two have a time and a position, or many are no latitude or longitude.

@@ -84,6 +84,7 @@ def _lz4() -> Any:
 
 
 def _zstd() -> Any:
+    """Return a decompressor of Zstandard."""
     if sys.version_info >= (3, 14):
         from compression import zstd
     else:
@@ -125,7 +126,7 @@ def _ros1_messages(path: Path) -> Iterator[BagMessage]:
 
 
 def _messages(path: Path, chunk: bytes, topics: dict[bytes, str]) -> Iterator[BagMessage]:
-    """Yield the position messages of a chunk; new connections are added to `topics`."""
+    """Yield the position messages of a ROS 1 chunk; new connections go to `topics`, in place."""
     for fields, data in _records(path, io.BytesIO(chunk), (_MESSAGE, _CONNECTION)):
         if fields[b"op"][0] == _MESSAGE:
             topic = topics.get(fields[b"conn"])
@@ -145,7 +146,7 @@ def _messages(path: Path, chunk: bytes, topics: dict[bytes, str]) -> Iterator[Ba
 
 def _records(path: Path, file: IO[bytes],
              wanted: Collection[int]) -> Iterator[tuple[Fields, bytes]]:
-    """Yield fields and data of the wanted records, up to a truncated one."""
+    """Yield header fields and data of a ROS 1 bag's wanted records, until one is cut off."""
     while len(start := file.read(4)) == 4:
         size, = struct.unpack("<I", start)
         ROW_BYTES.check(size, f"{path}: a record's header")
@@ -165,7 +166,7 @@ def _records(path: Path, file: IO[bytes],
 
 
 def _fields(header: bytes) -> Fields:
-    """Parse the fields of a header: each is a length and `name=value`."""
+    """Parse the fields `name=value` in the header of a ROS 1 record, each after its length."""
     fields, at = {}, 0
     while at < len(header):
         size, = struct.unpack_from("<I", header, at)
@@ -217,7 +218,7 @@ class _Walk:
         self._channels: dict[int, tuple[str, bool]] = {}  # topic, and whether of ROS 1
 
     def messages(self, file: IO[bytes], is_chunk: bool = False) -> Iterator[BagMessage]:
-        """Yield the position messages of a file, or of a chunk."""
+        """Yield the position messages of an MCAP file, or of a chunk in it, until it is cut off."""
         begin = file.tell()
         end = file.seek(0, io.SEEK_END)
         file.seek(begin)
@@ -251,7 +252,7 @@ class _Walk:
         return self._chunks.open(compression, body[at + 8:at + 8 + size])
 
     def _declare(self, kind: int, body: bytes) -> None:
-        """Note a schema of positions, or a channel of one."""
+        """Note a schema if it is of positions, or a channel if its schema is one."""
         number, = struct.unpack_from("<H", body)
         if kind == _SCHEMA:
             if is_fix(_text(body, 2)[0]):
@@ -283,11 +284,8 @@ def read_rosbag(path: Path, topic: str | None = None) -> Fixes:
     """Read the positions of a ROS 1 bag (.bag) or a ROS 2 bag (.mcap, .db3, or its folder).
 
     Times are those of the messages' headers, else of the recording. Messages without a fix are left
-    out.
+    out. `topic` None: the only topic with positions.
 
-    Args:
-        path: of the bag.
-        topic: None: the only topic with positions.
 
     Raises:
         BadInput: rosbags is not installed, the bag is damaged, or the topic is missing.
@@ -313,7 +311,7 @@ def read_rosbag(path: Path, topic: str | None = None) -> Fixes:
 
 
 def _decoders(path: Path) -> tuple[Callable[[bytes, str], Any], Callable[[bytes, str], Any]]:
-    """Return the functions that decode messages of ROS 2, and of ROS 1."""
+    """Return two functions that decode messages: of ROS 2, and of ROS 1."""
     types = optional_package(
         "rosbags.typesys", f"{path}: ROS bags need the package rosbags; `pip install "
                            "radiotwin[ros]`, or convert its positions to GPX or a table")
@@ -322,7 +320,7 @@ def _decoders(path: Path) -> tuple[Callable[[bytes, str], Any], Callable[[bytes,
 
 
 def _parts(path: Path) -> list[Path]:
-    """Return the files of a bag."""
+    """Return the files of a bag: those in a folder, or the file; BadInput if compressed."""
     if path.is_dir():
         found = sorted(each for each in path.iterdir() if each.suffix.lower() in (".mcap", ".db3"))
         if not found:
@@ -344,7 +342,7 @@ def _fix_row(fix: Any, time_ns: int) -> tuple[float, float, float, float]:
 
 def _rows_of_topic(path: Path, topics: dict[str, "array[float]"], topic: str | None
                    ) -> "array[float]":
-    """Return the rows of the declared topic, or of the only one."""
+    """Return the rows of a topic (None: the only one); BadInput if it is not there."""
     if topic is None and len(topics) == 1:
         return next(iter(topics.values()))
     if not topics:

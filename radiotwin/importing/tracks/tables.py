@@ -46,7 +46,7 @@ def _plain(name: str) -> str:
 
 
 def _split(name: str) -> tuple[str, str]:
-    """Split the name of a column into its plain name, and its unit in lower case, or `""`."""
+    """Split a column's name into its plain name and its unit (lower case; `""`: none)."""
     unit = _UNIT.search(name)
     if unit is None:
         return _plain(name), ""
@@ -54,7 +54,7 @@ def _split(name: str) -> tuple[str, str]:
 
 
 def _find(header: list[str], quantity: str, unit: str | None = None) -> str | None:
-    """Find the column of a quantity, in a given unit (None: any); None if there is none."""
+    """Find the column of a quantity by its usual names, in a unit (None: any); None: no column."""
     columns = {_split(name): name for name in reversed(header)}
     for word in map(_plain, _NAMES[quantity].split(",")):
         for (plain, column_unit), name in columns.items():
@@ -133,7 +133,10 @@ def _times(source: Source, header: list[str], track: TrackFile,
 
 
 def _time_format(source: Source, spec: str) -> str:
-    """Return the format of a column of times; for numbers it follows from their size."""
+    """Return the format of a column of times: ISO 8601, or for numbers s, ms, … since 1970.
+
+    The unit is the one that makes the median a time from 1985 to 2128; BadInput if none does.
+    """
     numbers = as_numbers(as_text(source.cells(spec, "time")))
     known = numbers[np.isfinite(numbers)]
     if not len(known):

@@ -72,7 +72,7 @@ def read_nmea(path: Path) -> Fixes:
 
 
 def _sentence(line: str) -> tuple[list[str], bool]:
-    """Split an NMEA sentence into fields; return also whether its check sum is wrong."""
+    """Split an NMEA sentence into fields; `[""]` and True if its check sum is wrong."""
     body, star, check = line.strip().partition("*")
     if not body.startswith("$"):
         return [""], False
@@ -85,7 +85,10 @@ def _sentence(line: str) -> tuple[list[str], bool]:
 
 def _add(rows: list[list[float]], seconds: float, day: float, place: list[str],
          height_m: float) -> None:
-    """Add a position, or complete the last one by the other sentence (RMC, GGA) of its time."""
+    """Add a position to `rows` in place; if the last one has its time, complete that instead.
+
+    The sentences RMC (date) and GGA (height) of one time make one position.
+    """
     latitude, longitude = _degrees(place[0], place[1]), _degrees(place[2], place[3])
     if rows and rows[-1][0] == seconds:
         row = rows[-1]
@@ -97,7 +100,7 @@ def _add(rows: list[list[float]], seconds: float, day: float, place: list[str],
 
 
 def _days(seconds: np.ndarray, day: np.ndarray) -> np.ndarray:
-    """Return the day of each position: the last date, plus one after each midnight since."""
+    """Return the day of each position: the last date, plus one day after each midnight since."""
     result = np.array(day)
     first = int(np.argmax(np.isfinite(day))) if len(day) else 0
     if len(day):
@@ -137,6 +140,7 @@ def _time_s(where: object, text: str) -> float:
 
 
 def _numbers(path: Path, texts: Sequence[Any]) -> list[float]:
+    """Return three coordinates as numbers, NaN where missing; BadInput if one is no number."""
     try:
         numbers = [float(text) for text in texts[:3]]
     except (TypeError, ValueError):
@@ -186,6 +190,7 @@ class _Points(_Rows):
             self._point, self._line = dict(attributes), line
 
     def end(self, name: str, text: str) -> None:
+        """Handle the end of a GPX element: keep a point's time and height, and add it as a row."""
         if self._point is not None and name in ("ele", "time"):
             self._point.setdefault(name, text)
         elif self._point is not None and name == "trkpt":
@@ -197,6 +202,7 @@ class _Points(_Rows):
             self._point = None
 
     def _number(self, text: str, name: str) -> float:
+        """Return a text as a number; BadInput names file and line."""
         try:
             return float(text)
         except ValueError:
@@ -228,6 +234,7 @@ class _Track(_Rows):
             self._clear()
 
     def end(self, name: str, text: str) -> None:
+        """Handle the end of a KML element: collect times, places and angles; add a track's rows."""
         if name == "when":
             self._times.append(_time_s(self.path, text) if text else np.nan)
         elif name == "coord":
@@ -250,7 +257,7 @@ class _Track(_Rows):
 
 
 def read_kml(path: Path) -> Fixes:
-    """Read the tracks of a KML file, without altitudes above the ground.
+    """Read the tracks of a KML file; altitudes above the ground are not used (NaN, and a note).
 
     Raises:
         BadInput: no KML, or fewer than two places with a time.
