@@ -60,7 +60,7 @@ class LogFile:
                 yield content
 
     def read_text(self, budget: Budget) -> str:
-        """Read a text in UTF-8; BadInput if it is none, or too large."""
+        """Read the file as text in UTF-8; BadInput if it is not UTF-8, or too large."""
         with self.open() as file:
             data = bytearray()
             while block := file.read(BLOCK_BYTES):  # a single read would allocate the limit
@@ -183,7 +183,7 @@ def _check_directory(file: IO[bytes], path: Path) -> None:
 
 
 def _in_archive(path: Path) -> tuple[list[LogFile], int]:
-    """Return the texts in a zip file, and the number of its other files."""
+    """Return the files in a zip file that are texts, and the number of the others."""
     with open_archive(path) as archive:
         names = [entry.filename for entry in archive.infolist() if not entry.is_dir()]
     names = sorted(name for name in names if not _is_hidden(PurePosixPath(name)))

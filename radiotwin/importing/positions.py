@@ -215,7 +215,7 @@ def _read_sites(path: str, key: str, settings: Settings, names: Collection[str])
 
 
 def _periods(source: Source, sites: SiteTable, settings: Settings) -> dict[str, np.ndarray]:
-    """Read the start and end of the time at each position [s]; NaN: not given."""
+    """Read since and until when a device was at each position [s since 1970]; NaN: not given."""
     since_s = seconds(source, sites.columns["since"], ISO, settings.time_zone)
     until_s = np.full(len(source), np.nan)
     if "until" in sites.columns:

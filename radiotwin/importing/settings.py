@@ -257,7 +257,7 @@ class Settings(Table):
 
 
 def parse_columns(text: str) -> dict[str, str]:
-    """Parse pairs such as `latitude=lat,longitude=lon`; BadInput if they are none, or repeated."""
+    """Parse pairs such as `latitude=lat,longitude=lon`; BadInput if one is no pair, or repeated."""
     pairs: dict[str, str] = {}
     for part in text.split(","):
         name, equals, value = (piece.strip() for piece in part.partition("="))

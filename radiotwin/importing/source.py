@@ -143,7 +143,7 @@ class Source:
         return text
 
     def require(self, specs: Mapping[str, str]) -> None:
-        """Raise BadInput unless the file has all columns of a mapping: quantity -> spec."""
+        """Raise BadInput unless the file has all columns in a mapping: quantity -> entry."""
         missing = [f"{name!r} ({purpose})" for purpose, spec in specs.items()
                    for name in columns_of(spec, self.table) if name not in self.table]
         if missing:

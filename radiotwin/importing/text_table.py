@@ -86,7 +86,7 @@ class Dialect:
 
 def find_dialect(file: LogFile, settings: Settings, expected: Sequence[Collection[str]],
                  names: Sequence[str]) -> Dialect:
-    """Detect the dialect of a text, as far as it is not declared.
+    """Detect encoding, header, delimiter, decimal mark, … of a text, where they are not declared.
 
     Args:
         file: of text.
@@ -353,7 +353,7 @@ class TextTable:
 
 
 def read_text_table(file: LogFile, dialect: Dialect, bad_rows: BadRows | None) -> TextTable:
-    """Read all cells of a text.
+    """Read the rows of a text file, written in a known dialect, as a table of texts.
 
     Args:
         file: of text.

@@ -134,7 +134,7 @@ def _check_inflation(array: h5py.h5d.DatasetID, chunk_bytes: int, what: str) -> 
 
 
 def _check_attributes(owner: h5py.h5g.GroupID | h5py.h5d.DatasetID, path: Path, what: str) -> int:
-    """Check attributes by type and size; return the number of texts of unknown length in them."""
+    """Check an HDF5 object's attributes by type and size; count their texts of unknown length."""
     count = h5py.h5a.get_num_attrs(owner)
     MAP_ATTRIBUTES.check(count, f"{path}: {what}")
     texts = size = 0

@@ -34,7 +34,7 @@ class Budget:
 
     @property
     def limit(self) -> int:
-        """Present limit; BadInput if the variable is set to anything but a positive integer."""
+        """Limit from the environment variable (BadInput: no positive integer), else the default."""
         text = os.environ.get(self.variable)
         if text is None:
             return self.default

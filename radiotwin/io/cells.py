@@ -98,7 +98,7 @@ class CsvLayout:
             yield self._checked(rest)
 
     def _checked(self, block: bytes) -> bytes:
-        """Return a block if it is UTF-8 text without null characters; note apostrophes."""
+        """Return a block unchanged if it is UTF-8 text; note whether it has apostrophes."""
         block.decode()
         if b"\0" in block:
             raise BadInput(f"{self._path} is not text in UTF-8 (it has null characters); allowed "

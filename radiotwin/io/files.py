@@ -316,7 +316,7 @@ def _lock(name: str) -> int | None:
 
 @cache  # once a folder and process: a store of batches writes thousands of files to one
 def _sweep(folder: Path) -> None:
-    """Remove the temporary folders of killed processes from a folder."""
+    """Remove from a folder the temporary folders that killed processes left in it."""
     if fcntl is None:
         return
     with suppress(OSError):

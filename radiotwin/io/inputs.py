@@ -162,12 +162,12 @@ def read_bytes(path: Path | str, what: str = "file", budget: Budget = FILE_BYTES
 
 def read_text(path: Path | str, what: str = "text file",
               budget: Budget = DOCUMENT_BYTES) -> str:
-    """Read a text in UTF-8, with or without a byte-order mark; BadInput if it is none."""
+    """Read a text in UTF-8, with or without a byte-order mark; BadInput if it is not UTF-8."""
     return decode_text(read_bytes(path, what, budget), path)
 
 
 def decode_text(data: bytes, path: object) -> str:
-    """Decode a text in UTF-8, with or without a byte-order mark; BadInput if it is none."""
+    """Decode a text in UTF-8, with or without a byte-order mark; BadInput if it is not UTF-8."""
     try:
         return data.decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError as error:
@@ -204,7 +204,7 @@ def parse_json(text: str, source: object, allow_nan: bool = False) -> Any:
 
 
 def read_toml(path: Path | str, what: str = "TOML file") -> dict[str, Any]:
-    """Read a TOML document; BadInput if it is none, nested too deeply, or has too long numbers."""
+    """Read a TOML document; BadInput if it is no TOML, nested too deeply, or has long numbers."""
     text = read_text(path, what, SETTINGS_BYTES)
     # The memory of tomllib grows with the square of the parts of a key.
     if re.search(rf"(?:^|[\[{{,])[ \t]*+{_KEY_PART}(?:{_KEY_DOT}{_KEY_PART}){{{NESTING.limit}}}",

@@ -65,7 +65,7 @@ def handle() -> None:
 
 
 def begin() -> None:
-    """Raise signals from now on."""
+    """Raise signals as `Stopped` from now on, as the work begins."""
     _state.received, _state.flying, _state.deferred = None, None, 0
     sys.unraisablehook = _show_unraisable
     _state.raising = True

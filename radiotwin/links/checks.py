@@ -365,7 +365,7 @@ def ceiling_notes(receiver: np.ndarray, names: Sequence[str], level_db: np.ndarr
 
 
 def _is_heap(counts: np.ndarray) -> bool:
-    """Return whether the first value is far more frequent than its neighbours, by counts (m,)."""
+    """Return whether the first value is far more frequent than the next five, by counts (m,)."""
     return bool(counts[0] >= MIN_HEAP and counts[0] > HEAP_RATIO * counts[1:6].max())
 
 

@@ -32,8 +32,8 @@ def evidence_blocks(links: Links) -> np.ndarray:
     """Return the index (n,) of the piece of evidence to which each link belongs.
 
     A piece is a group of links whose errors are alike, so that scores count it as one observation:
-    links of one device, receiver and flight on one square of ground. Its side is the correlation
-    length that `with_evidence` estimated, or `UNKNOWN_M` before that.
+    links of one device, receiver and flight on one square of ground. Its side is about the
+    correlation length that `with_evidence` estimated, or `UNKNOWN_M` before that.
     """
     return _evidence(links)[:, 0]
 

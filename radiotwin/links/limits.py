@@ -406,9 +406,9 @@ def _limit_text(name: str, limit_db: float, found: LimitEstimate | None, unit: s
 def limits_to_explain(links: Links) -> Links:
     """Give receivers that detect too little the usual limit of detection, not their own.
 
-    Blanks (links not detected) above the usual limit then need another explanation, which a model
-    of faults may find. Such a receiver is clearly less sensitive than most, or has blanks at any
-    level. If no limit is known, the lowest reading is that of all receivers.
+    Blanks (not detected) that are predicted above this limit then need another explanation. Such a
+    receiver is clearly less sensitive than most, or has blanks at any level. If no limit is known,
+    the lowest reading is that of all receivers.
     """
     usual_db = links.usual_limit_db
     if usual_db is None:

@@ -462,7 +462,7 @@ def _name_column(path: Path | str, cells: pd.DataFrame, end: str, names: Collect
 
 def _numbers(table: SiteTable, quantity: str, convert: Convert | None, length_unit: str | None,
              crs: bool) -> np.ndarray:
-    """Convert cells of a quantity to numbers (k,) in its unit; NaN: empty. Else BadInput."""
+    """Convert cells of a quantity to numbers (k,) in its unit, NaN: empty; or raise BadInput."""
     name = table.columns[quantity]
     cells = table.cells[name]
     if cells.dtype.kind in "fiu":

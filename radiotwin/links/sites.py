@@ -39,7 +39,7 @@ QUANTILE = 0.95  # upper end of a 90 % interval
 
 
 def site_of(links: Links, device: int) -> list[int]:
-    """Return the indices of a device and of the anchors on its mast, ascending."""
+    """Return the indices of a device and of the anchors within `SAME_SITE_M` of it, ascending."""
     apart_m = np.linalg.norm(links.device_m - links.device_m[device], axis=1)
     return [int(other) for other in np.flatnonzero(apart_m <= SAME_SITE_M)
             if other == device or other in links.anchors]
@@ -150,7 +150,7 @@ def inseparable_pairs(one: np.ndarray, other: np.ndarray) -> dict[int, int]:
 
 
 def inseparable_end(links: Links, end: str, members: set[int]) -> str | None:
-    """Return the other end (device or receiver) if a member has all links with one member there.
+    """Return the other end (device or receiver) if a member and one there have the same links.
 
     Errors of a device and a receiver with exactly the same detected links cannot be told apart.
     `members` are indices at `end`. None: all can be told apart.

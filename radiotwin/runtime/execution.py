@@ -98,7 +98,7 @@ class Executor:
 
     def run(self, job: Job[P, R], pieces: Sequence[P], cache: Cache[P, R] | None = None
             ) -> list[R]:
-        """Run a job.
+        """Call a job's function with each piece, here or on workers, and return the results.
 
         Args:
             job: function and resources.

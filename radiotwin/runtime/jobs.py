@@ -229,7 +229,7 @@ class Pool(ABC):
             count: number of pieces, and largest number of workers.
 
         Returns:
-            none if workers would not be faster than this process.
+            the workers; no worker if they would not be faster than this process.
 
         Raises:
             RunFailed: the requested workers do not fit on the machine.

@@ -75,7 +75,7 @@ class PieceStore:
 
     @property
     def progress(self) -> str:
-        """Message with the number of parts from an earlier run; empty if there are none."""
+        """Message with the number of results from an earlier run; empty if there are none."""
         if not self.earlier:
             return ""
         return (f"{self.earlier} of {self.earlier + self.made} parts were kept from an earlier "
@@ -83,7 +83,7 @@ class PieceStore:
 
     def get(self, name: str, unpack: Callable[[dict[str, np.ndarray], Any], T],
             ) -> tuple[T, list[str]] | None:
-        """Read a part and its warnings; None if it is absent or damaged."""
+        """Read a cached result and its warnings; None if it is absent or damaged."""
         path = self.folder / f"{name}.npz"
         try:
             if not path.is_file():
@@ -117,7 +117,7 @@ class PieceStore:
         self._shrink(len(data))
 
     def files(self) -> list[tuple[float, int, Path]]:
-        """Return time of the last use [s], size [bytes] and path of every part."""
+        """Return time of last use [s since 1970], size [bytes] and path of every cached result."""
         found = []
         with suppress(OSError):
             for entry in os.scandir(self.folder):
@@ -129,7 +129,7 @@ class PieceStore:
         return found
 
     def clear(self) -> int:
-        """Remove all parts; return their number."""
+        """Remove all cached results; return their number."""
         count = 0
         for _, _, path in self.files():
             with suppress(FileNotFoundError):
@@ -156,7 +156,7 @@ class PieceStore:
 
 
 def cache_content() -> dict[str, Any]:
-    """Return the content of the cache, by kind of part.
+    """Return the number and size of cached results, by kind.
 
     Returns:
         `folder`, `bytes`, `limit_bytes`, and `parts`: kind -> `parts` (their number) and `bytes`.

@@ -84,7 +84,7 @@ def _counted(path: Path, name: str) -> int:
 
 
 def resident_bytes(pid: int) -> int:
-    """Return the resident memory of a process; 0 if that is unknown, or it has ended."""
+    """Return the resident memory [bytes] of a process; 0 if unknown, or if it has ended."""
     with suppress(OSError, ValueError, IndexError, AttributeError):
         pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
         return pages * os.sysconf("SC_PAGE_SIZE")

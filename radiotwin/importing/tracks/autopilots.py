@@ -97,7 +97,7 @@ def _nearest(attitude: np.ndarray, clock_s: np.ndarray) -> dict[str, np.ndarray]
 
 
 def _messages(content: bytes) -> Iterator[tuple[str, dict[str, float]]]:
-    """Yield the GPS and ATT messages of a binary log; damaged parts are skipped."""
+    """Yield the GPS and ATT messages of a binary ArduPilot log: name, and label -> number."""
     lengths = {_FMT: _FMT_BYTES}
     kinds: dict[int, tuple[str, str, list[str]]] = {}
     at = content.find(_MAGIC)
@@ -128,7 +128,7 @@ def _messages(content: bytes) -> Iterator[tuple[str, dict[str, float]]]:
 
 
 def _text_messages(content: bytes) -> Iterator[tuple[str, dict[str, float]]]:
-    """Yield the GPS and ATT messages of a text log, in which numbers are scaled already."""
+    """Yield the GPS and ATT messages of an ArduPilot log in text form: name, label -> number."""
     labels: dict[str, list[str]] = {}
     for line in content.decode("ascii", "replace").splitlines():
         fields = [field.strip() for field in line.split(",")]

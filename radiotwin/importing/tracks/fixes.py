@@ -27,7 +27,7 @@ class Fixes:
     notes: tuple[str, ...] = ()
 
     def at(self, time_s: np.ndarray, max_gap_s: float) -> dict[str, np.ndarray]:
-        """Interpolate at times (m,) [s since 1970 UTC].
+        """Interpolate positions and angles at times (m,) [s since 1970 UTC].
 
         Returns:
             column -> (m,); NaN if the neighbouring positions are more than `max_gap_s` apart.

@@ -166,7 +166,7 @@ def _with_milliseconds(source: Source, header: list[str], time_s: np.ndarray) ->
 
 
 def _day_and_hour(source: Source, day: str, hour: str, zone: str | None) -> np.ndarray:
-    """Read times [s] from a column of dates (month first with slashes) and one of hours."""
+    """Read times [s since 1970] from two columns: dates (month first with slashes) and hours."""
     texts = {name: as_text(source.cells(name, "time")) for name in (day, hour)}
     forms: Mapping[str, tuple[str, ...]] = {day: _DAY_FORMATS, hour: _HOUR_FORMATS}
     chosen = []

@@ -32,7 +32,7 @@ _PLACE = ("latitude", "longitude", "altitude")
 
 
 def read_nmea(path: Path) -> Fixes:
-    """Read the track of NMEA 0183 sentences of any talker, without damaged ones.
+    """Read the track in an NMEA 0183 log; damaged sentences are left out, with a note.
 
     Raises:
         BadInput: no date, or fewer than two positions.
@@ -284,7 +284,7 @@ def _part(value: object, name: str) -> dict[str, Any]:
 
 
 def read_geojson(path: Path) -> Fixes | None:
-    """Read the lines with times of a GeoJSON file; None if there are none.
+    """Read the tracks of a GeoJSON file: lines with a time at each point; None if it has none.
 
     Raises:
         BadInput: a line has another number of times than of positions.
