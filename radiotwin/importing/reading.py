@@ -338,10 +338,7 @@ def _naming_notes(source: Source, settings: Settings) -> list[str]:
 
 
 def _match(pattern: str, name: str) -> str | None:
-    """Match a name with a pattern; return the text that `*` stands for, None if it does not fit.
-
-    A pattern without `*` returns the whole name.
-    """
+    """Return the text that `*` stands for in a name, or the name without `*`; None: no match."""
     if "*" not in pattern:
         return name if name == pattern else None
     before, after = pattern.split("*", 1)
@@ -487,11 +484,7 @@ def _declared_columns(settings: Settings) -> set[str]:
 
 def _settings_for(source: Source, settings: Settings,
                  flight: str) -> tuple[Settings, str | None, str]:
-    """Complete the settings by those of the file's format; return also its name and a caution.
-
-    The format is the declared one, else the one that fits the header; None if no format does.
-    `flight` is the default entry for the flight.
-    """
+    """Complete the settings by those of the file's format; return also its name and a caution."""
     header = list(map(str, source.table))
     found = None
     if settings.format:
@@ -515,10 +508,7 @@ def _settings_for(source: Source, settings: Settings,
 
 
 def _renumbered(source: Source, first: int, prefix: str) -> Source:
-    """Renumber the rows of a file from `first`, so that rows of several files differ.
-
-    Messages name them with `prefix`, which tells the file.
-    """
+    """Renumber rows from `first`, to differ between files; put `prefix` before their places."""
     where = source.where
     table = source.table.set_axis(pd.RangeIndex(first, first + len(source)))
     return replace(source, table=table, where=lambda index: f"{prefix}{where(index - first)}",
@@ -567,10 +557,7 @@ def _drop_truncated_rows(source: Source, settings: Settings) -> Source:
 
 def _file_links(source: Source, settings: Settings, tally: Tally, problems: Problems,
               name: str) -> tuple[pd.DataFrame, int]:
-    """Return the links of a file, and the number of readings in each of its rows.
-
-    Rows that repeat another, or that the setting `only` excludes, are counted in the tally.
-    """
+    """Return the links of a file and its readings per row; count repeated and unselected rows."""
     unique, repeated = without_repetition(source)
     chosen, others = _selected_rows(unique, settings)
     links, per_row = build_links(chosen, settings, tally, problems, name)
@@ -582,11 +569,7 @@ def _file_links(source: Source, settings: Settings, tally: Tally, problems: Prob
 
 def _selected_rows(source: Source, settings: Settings
                    ) -> tuple[Source, list[tuple[list[int], str, str]]]:
-    """Select the rows in which columns have the values of the setting `only`.
-
-    Returned are also the indices of the others, the reason, and the column that decided. BadInput
-    if no row has a value.
-    """
+    """Select rows by the setting `only`: column -> values; return also why others are left out."""
     left_out = []
     for spec, values in settings.only.items():
         texts = [value for value in values if isinstance(value, str)]

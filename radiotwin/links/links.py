@@ -48,11 +48,7 @@ def clocks_restart(tracks: Tracks) -> bool:
 
 
 def _restarts(flights: list[tuple[np.ndarray, np.ndarray]]) -> bool:
-    """Return whether a receiver's clock starts anew in each of its flights, sorted by start.
-
-    A flight is its times (m,) [s] and positions (m, 3) [m]. Only flights longer than `MIN_FLIGHT_S`
-    can show it by equal starts.
-    """
+    """Return whether a receiver's clock starts anew in each of its flights, sorted by start."""
     starts_s = np.array([time_s[0] for time_s, _ in flights])
     lengths_s = np.array([time_s[-1] - time_s[0] for time_s, _ in flights])
     if np.ptp(starts_s) <= SAME_START_S and (lengths_s > MIN_FLIGHT_S).all():
@@ -62,11 +58,7 @@ def _restarts(flights: list[tuple[np.ndarray, np.ndarray]]) -> bool:
 
 def _at_two_places(one: tuple[np.ndarray, np.ndarray],
                    other: tuple[np.ndarray, np.ndarray]) -> bool:
-    """Return whether two tracks of one receiver put it at two places at the same times.
-
-    A track is times (m,) [s], ascending, and positions (m, 3) [m]. They must be more than
-    `ELSEWHERE_M` apart for a share `MIN_ELSEWHERE` of the times that both have.
-    """
+    """Return whether two tracks (times, positions) of one receiver put it at two places at once."""
     (time_s, position_m), (other_s, other_m) = one, other
     common = (time_s >= other_s[0]) & (time_s <= other_s[-1])
     if common.sum() < 2:
@@ -265,10 +257,7 @@ class Flown:
 
     @classmethod
     def of(cls, columns: Columns) -> Flown:
-        """Collect the track (times [s] and positions [m]) of each receiver and flight from links.
-
-        Links without a time are left out; of several at one time, the first counts.
-        """
+        """Collect the track of each receiver and flight from those links that have a time."""
         timed = np.flatnonzero(np.isfinite(columns.time_s))
         if not len(timed):
             return cls()
@@ -487,11 +476,7 @@ class Links:
 
     @cached_property
     def receiver_axes(self) -> np.ndarray:
-        """Unit vectors to each receiver's right, nose and top, (n, 3, 3); NaN where unknown.
-
-        They are in the local frame (east, north, up). Without any headings north is assumed; an
-        unknown pitch or roll is 0.
-        """
+        """(n, 3, 3) vectors (east, north, up) to the receiver's right, nose, top; NaN: unknown."""
         heading, pitch, roll = (
             np.radians(np.zeros(len(self)) if angle is None else angle) for angle in
             (self.heading_deg, *(angle if angle is None else np.nan_to_num(angle)
@@ -512,10 +497,7 @@ class Links:
 
     @cached_property
     def diffraction_parameter(self) -> np.ndarray:
-        """Largest knife-edge parameter ν over the roofs below each link, (n,); NaN without a map.
-
-        ITU-R P.526-15, Eq. 26; it is negative if all roofs are below the straight line.
-        """
+        """(n,) largest knife-edge ν over the roofs (ITU-R P.526-15, Eq. 26); NaN without a map."""
         greatest = np.full(len(self), np.nan)
         if self.city is None or np.isnan(self.frequency_hz):
             return greatest

@@ -212,10 +212,7 @@ def misspelt(name: str, known: Iterable[str]) -> str | None:
 
 
 def _edits(one: str, other: str) -> int:
-    """Count the edits from one word to another: letters added, dropped, replaced, swapped.
-
-    Only neighbouring letters are swapped (Damerau 1964).
-    """
+    """Count the letters added, dropped, replaced or swapped between two words (Damerau 1964)."""
     before: list[int] = []
     last, row = before, list(range(len(other) + 1))
     for i, letter in enumerate(one, start=1):
@@ -263,9 +260,7 @@ class SiteTable:
                            + (f" ({len(rows)} such rows)" if len(rows) > 1 else ""))
 
     def local_m(self, origin: Origin | None, own: Origin | None, what: str) -> np.ndarray:
-        """Return positions (k, 3) [m] in a local frame; NaN: unknown.
-
-        A height above the ground is no z: it stays NaN.
+        """Return positions (k, 3) [m] in a local frame; NaN: unknown, or z is above the ground.
 
         Args:
             origin: of the target frame; None: unknown.
@@ -396,11 +391,7 @@ def _unused_note(path: Path | str, unused: Mapping[str, str]) -> list[str]:
 
 
 def _redundant_position(given: Collection[str], crs: bool, prefers_globe: bool) -> tuple[str, ...]:
-    """Return the coordinates to ignore in a table that has both latitude, longitude and x, y.
-
-    With a reference system (`crs`) of x and y these count; else `prefers_globe` decides for
-    latitude and longitude. Without either both pairs are used.
-    """
+    """Return which of latitude, longitude and x, y to ignore: `crs` prefers x and y."""
     if not {"latitude", "x"} <= set(given) or not (crs or prefers_globe):
         return ()
     pair = ("latitude", "longitude") if crs else ("x", "y")
@@ -409,10 +400,7 @@ def _redundant_position(given: Collection[str], crs: bool, prefers_globe: bool) 
 
 def _columns(path: Path | str, header: Sequence[str],
              crs: bool) -> tuple[dict[str, str], dict[str, str]]:
-    """Assign columns to quantities by their names; return also unused columns -> reason or `""`.
-
-    BadInput: a column holds a part of an angle, or its name is nearly a known one.
-    """
+    """Assign columns to quantities by their names; return also unused columns -> reason or `""`."""
     known = _known_names(crs)
     by_rank = sorted((name for name in header if _plain(name) in known),
                      key=lambda name: known[_plain(name)].rank)
@@ -442,12 +430,7 @@ def _columns(path: Path | str, header: Sequence[str],
 
 def _name_column(path: Path | str, cells: pd.DataFrame, end: str, names: Collection[str],
                  taken: set[str]) -> tuple[str, dict[str, str]]:
-    """Find the column with the names of the sites; BadInput if there is none.
-
-    Of several, the one called `end` (`device` or `receiver`) counts, else that with most of the
-    expected `names`. Columns in `taken` hold other quantities. Also returned are the other columns
-    that look like names -> why they are not used.
-    """
+    """Return the column of names (`end`, or with most of `names`), and others -> why not used."""
     words = _words(_NAMES[end])
     found = sorted((name for name in map(str, cells)
                     if _plain(name) in words and name not in taken),
