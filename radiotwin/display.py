@@ -55,7 +55,7 @@ class PlotFrame:
 
     @classmethod
     def choose(cls, origin: Origin | None, geographic: bool | None) -> PlotFrame:
-        """Choose longitude and latitude, or metres; `geographic` None: by whether origin is known.
+        """Choose axes in degrees if `geographic`, else metres; None: degrees if origin is known.
 
         Raises:
             BadInput: longitude and latitude are requested without an origin.
@@ -73,7 +73,7 @@ class PlotFrame:
         return to_geographic(self.origin, x_m, y_m)
 
     def prepare(self, ax: Axes) -> None:
-        """Label the axes and set the same scale [m] on both."""
+        """Label the axes, and give a metre the same length on both."""
         if self.origin is None:
             ax.set(xlabel="x, east [m]", ylabel="y, north [m]", aspect="equal")
             return
@@ -121,7 +121,10 @@ def add_legend(ax: Axes) -> None:
 
 
 def _edges(along_m: np.ndarray, across_m: np.ndarray) -> np.ndarray:
-    """Return the (n + 1,) borders of cells; a single cell is as wide as those across."""
+    """Return the (n + 1,) borders of cells around n ascending positions along an axis [m].
+
+    A single cell is as wide as the cells along the other axis (`across_m`), or else 1 m.
+    """
     if len(along_m) > 1:
         step_m = np.diff(along_m)
     else:
@@ -143,7 +146,7 @@ def residual_range_db(residual_db: np.ndarray) -> float:
 
 
 def level_range_db(level_db: np.ndarray) -> tuple[float, float]:
-    """Return the ends of a colour scale [dB] that contains nearly all finite values."""
+    """Return the ends of a colour scale [dB]: the 1 and 99.5 % quantiles of the finite levels."""
     finite = level_db[np.isfinite(level_db)]
     if not len(finite):
         return -1.0, 0.0
@@ -170,7 +173,7 @@ class Summary:
         return f"<{self.kind}: {' '.join(shown(self.line, MAX_LINE).split())}>"
 
     def html(self) -> str:
-        """Return a table; every text is escaped."""
+        """Return the summary as an HTML table; every text is escaped."""
         rows = "".join(
             f'<tr><th style="text-align:left">{escape(shown(subject, MAX_CELL))}</th>'
             f'<td style="text-align:left">{escape(shown(finding, MAX_CELL))}</td></tr>'

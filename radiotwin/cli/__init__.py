@@ -1,8 +1,8 @@
 """The entry point of the command `radiotwin`.
 
 Commands that pass strangers' files to libraries in C and C++ run in a child process. We check what
-these libraries assume about a file, but an unforeseen fault may still crash the process. Then its
-parent reports the command and the file, and exits with 2.
+these libraries assume about a file, but a fault that we do not check for may crash the process. The
+parent process then reports the command and the file, and exits with 2.
 """
 
 import os
@@ -36,7 +36,10 @@ def main() -> None:
 
 
 def _guard() -> None:
-    """Return in a child process that runs the command; the parent ends with its exit status."""
+    """Let a child process run the command: return in it, and end the parent with its exit status.
+
+    Where no child can be made safely, this process returns and runs the command itself.
+    """
     try:
         status = go_on_in_a_child()
     except BadInput as error:
@@ -52,9 +55,11 @@ def _refuse(error: BadInput) -> None:
 
 
 def go_on_in_a_child() -> int | None:
-    """Fork; return None in the child, and in the parent the child's exit status.
+    """Fork; return None in the child, and the child's exit status in the parent.
 
-    Forks only where that is safe, on Linux before any library has threads; else returns None.
+    Where a fork is not safe (not on Linux, or once NumPy has made threads), return None in this
+    process. Signals are passed on to the child. A signal that ends the child, other than a crash,
+    ends the parent, too.
 
     Raises:
         BadInput: a library crashed the child.
@@ -67,7 +72,7 @@ def go_on_in_a_child() -> int | None:
         die_with_parent(parent)
         return None
     for number in signals.NUMBERS:
-        if signal.getsignal(number) is not signal.SIG_IGN:  # nohup
+        if signal.getsignal(number) is not signal.SIG_IGN:  # as nohup sets
             signal.signal(number, lambda number, _: os.kill(child, number))
     _, status = os.waitpid(child, 0)
     code = os.waitstatus_to_exitcode(status)

@@ -117,7 +117,10 @@ def coverage(
 
 
 def _world(source: Path, scene: Path | None, model: str | None) -> "Scene":
-    """Return the scene of a source, once the options that go with it are checked."""
+    """Load the scene of a coverage source: the source itself, or --scene for a twin or radio map.
+
+    BadInput if --scene is missing, or if --scene or --model does not go with the source.
+    """
     from radiotwin.maps.file import is_map
     from radiotwin.scene import Scene
 
@@ -138,7 +141,7 @@ def _world(source: Path, scene: Path | None, model: str | None) -> "Scene":
 
 @contextmanager
 def _gains(source: Path, world: "Scene", model: str | None) -> "Iterator[Twin | RadioMap | str]":
-    """Open the twin or the radio map, or give the name of the law."""
+    """Yield the source of gains: an opened twin or radio map, or for a scene the name of a law."""
     from radiotwin.maps.export.tables import check_map_place
     from radiotwin.maps.radiomap import RadioMap
 

@@ -24,7 +24,7 @@ ROOF_MATERIALS = {"sionna:munich": {"metal": "itu_marble", "wood": "itu_brick"}}
 def run_demo(source: str = "preset:small", folder: Path | str = "demo", *, seed: int = 0,
              device: Device = "cpu",
              on_progress: Callable[[str], None] = lambda step: None) -> Comparison:
-    """Run the chain and write everything into a folder.
+    """Build, trace, survey, fit and compare a small scene, and write everything into a folder.
 
     Args:
         source: `preset:NAME` or any source of `build_scene`.
@@ -61,7 +61,10 @@ def run_demo(source: str = "preset:small", folder: Path | str = "demo", *, seed:
 
 
 def _scene(source: str, folder: Path, seed: int, on_progress: Callable[[str], None]) -> Scene:
-    """Return the scene that an earlier run left in the folder, or build one."""
+    """Load the scene that an earlier run left in the folder, or build it there.
+
+    A scene of another source or seed is BadInput.
+    """
     if (folder / "scene.toml").is_file():
         scene = Scene.load(folder)
         found = scene.config.provenance

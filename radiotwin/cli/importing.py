@@ -159,7 +159,7 @@ def import_(
 
 
 def _print(report: dict[str, Any]) -> None:
-    """Print readings read, left out and kept, files, ranges, origin, bad rows and warnings."""
+    """Print an import's report: readings read, left out and kept, files, ranges, origin, faults."""
     rows = [["read", "", report["readings"], f"{report['rows']} rows"]]
     rows += [[item["reason"], item["column"], -item["readings"], item["first"]]
              for item in report["left_out"]]
@@ -194,9 +194,10 @@ def _print(report: dict[str, Any]) -> None:
 
 
 def _tables(settings: "Settings") -> list[str]:
-    """Return options that name devices, receivers and tracks, for a repetition of the command.
+    """Return the options that name tables of devices, receivers and tracks, to repeat an import.
 
-    import.toml cannot name tables outside its folder, so the command line has to.
+    import.toml cannot name files outside its folder, so the command line has to. Tracks are left
+    out if one has a setting for which there is no option.
     """
     options = [text for name in ("devices", "receivers") if (table := getattr(settings, name))
                for text in (f"--{name}", table)]
@@ -212,7 +213,10 @@ def _tables(settings: "Settings") -> list[str]:
 
 
 def _tracks(texts: list[str] | None, given: dict[str, Any]) -> list[dict[str, Any]] | None:
-    """Parse `FILE` or `RECEIVER=FILE` of --track; `given` are settings of all tracks."""
+    """Parse values `FILE` or `RECEIVER=FILE` of --track into records, each with settings `given`.
+
+    Settings without a track are BadInput.
+    """
     given = {name: value for name, value in given.items() if value is not None}
     if texts is None:
         if given:
@@ -246,7 +250,7 @@ def _number(value: float | None, name: str) -> str:
 
 
 def _values(text: str | None) -> list[float | str] | None:
-    """Split `A,B,…` into finite numbers and texts."""
+    """Split `A,B,…` at commas; a part that is a finite number becomes one, others stay text."""
     if text is None:
         return None
     values: list[float | str] = []

@@ -54,10 +54,11 @@ def fit(
     workers: Workers = "auto",
     cluster: Cluster = None,
 ) -> None:
-    """Fit a twin: the channel and the unknown devices.
+    """Fit a twin: a channel model, and the positions of the unknown devices.
 
-    The channel is learnt from the anchors. With --model auto, segmented_nn locates the unknown
-    devices, and the model with the least held-out error predicts levels; else one does both.
+    The channel is learnt from the anchors, whose positions are known. With --model auto,
+    segmented_nn locates the unknown devices, and the model with the least held-out error predicts
+    levels; any other model does both.
     """
     from radiotwin.links.measurements import read_measurements
     from radiotwin.runtime.execution import open_executor
@@ -139,7 +140,7 @@ def map_(
 
     if out is None and is_map(twin):
         raise BadInput(f"{twin} is a radio map already; give the file to write with --out")
-    place = Path(os.path.realpath(twin))  # unlike resolve, it takes links in a circle
+    place = Path(os.path.realpath(twin))  # unlike resolve, it accepts circular links
     out = out or place.with_name(f"{place.name}.nc")
     heights_m = None if altitudes is None else parse_numbers("--altitudes", altitudes)
     world = Scene.load(scene)
@@ -178,7 +179,7 @@ def compare(
 ) -> None:
     """Compare all channel models on held-out flights.
 
-    Published laws that hold at the scene's frequency are among them, fitted to nothing.
+    Published laws that are valid at the scene's frequency are among them, without a fit.
     With --truth they are compared with the truth map, too.
     """
     from radiotwin.links.measurements import read_measurements
@@ -236,9 +237,9 @@ def close_loop(
     workers: Workers = "auto",
     cluster: Cluster = None,
 ) -> None:
-    """Find the effects that a model lacks.
+    """Find physical effects that a channel model lacks, such as a missing building.
 
-    They are added to the model, and the error before and after is reported.
+    They are added to the model, and its error on held-out links before and after is reported.
     """
     from radiotwin.closeloop.output.corrected_scene import (
         check_corrected_target,
@@ -334,7 +335,10 @@ def _print(report: dict[str, Any]) -> None:
 
 
 def _estimate(estimate: dict[str, Any]) -> list[float | str]:
-    """Return value, low and high of a parameter; texts if it is a reference or undetermined."""
+    """Return value and 90 % interval of a parameter; a word and two NaN if it has no estimate.
+
+    The word is "reference" for a fixed offset of 0 dB, else "not determined" (by the data).
+    """
     from radiotwin.report.closeloop_words import is_reference
 
     if is_reference(estimate):

@@ -108,7 +108,9 @@ def parse_origin(text: str | None) -> "Origin | None":
 
 def in_frame_of(scene: "Scene | None", measurements: "Measurements",
                 shift: str | None) -> "Measurements":
-    """Convert measurements to a scene's frame, or shift them by `DX,DY` [m] into it.
+    """Convert measurements to a scene's local frame, plus a shift of `DX,DY` [m] if one is given.
+
+    Without a scene they keep their frame.
 
     Raises:
         BadInput: not two numbers, a shift without a scene, or frames that cannot be related.
@@ -145,7 +147,7 @@ def parse_numbers(option: str, text: str, count: int | None = None,
         form: what to give, for the message.
 
     Raises:
-        BadInput: not so many finite numbers.
+        BadInput: the value is not `count` finite numbers.
     """
     try:
         values = [float(part) for part in text.split(",")]

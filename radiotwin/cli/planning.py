@@ -54,7 +54,8 @@ def plan(
 ) -> None:
     """Plan flights that collect the data of a twin's devices, with the share they will collect.
 
-    The plan is flown in worlds that the twin holds possible: P10 is collected in nine of ten.
+    The plan is flown in worlds that the twin holds possible. In nine of ten of them at least the
+    share P10 is collected.
     """
     from marl.plan_flights import PlanSettings, plan_flights
     from marl.plan_output import FILES, write_plan
@@ -85,7 +86,10 @@ def plan(
 
 
 def _show(planned: "PlannedFlights", wanted: float, confidence: float) -> None:
-    """Print the promised shares of all data and of each device, and the sizes compared."""
+    """Print the share of data that the plan collects, in all and by device, and fleet sizes tried.
+
+    `wanted` is the share to collect in at least the share `confidence` of the simulated worlds.
+    """
     from marl.promise import smallest
     from radiotwin.display import count
 

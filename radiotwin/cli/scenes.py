@@ -144,7 +144,12 @@ def build_scene(
 
 
 def _measured(path: Path, on_terrain: bool) -> tuple[float | None, list[float] | None]:
-    """Return the devices' frequency [Hz] and altitudes for the lattice [m]; None if unknown."""
+    """Return the devices' median frequency [Hz], and altitudes for the lattice [m] as measured.
+
+    Altitudes are the 10, 50 and 90 % quantiles of the receivers' heights, or their median if the
+    three are within `SAME_HEIGHT_M`. None where unknown, with a note; so are heights above the
+    datum if the scene has terrain (`on_terrain`).
+    """
     import numpy as np
 
     from radiotwin.links.measurements import read_measurements
@@ -224,7 +229,7 @@ def _content(folder: Path) -> list[str]:
 
 
 def _pairs(texts: list[str]) -> dict[str, str]:
-    """Parse values `NAME=ITU` of --material."""
+    """Parse values `NAME=ITU` of --material into ITU materials by name in the file."""
     pairs = {}
     for text in texts:
         name, equals, itu = text.partition("=")
@@ -266,7 +271,7 @@ def trace(
                        "the batches are kept for the run.")] = False,
     force: Force = False,
 ) -> None:
-    """Ray-trace the truth with Sionna RT.
+    """Ray-trace a scene's radio map, the truth, with Sionna RT.
 
     A killed run is resumed, a finished one is reused.
     """
@@ -304,7 +309,7 @@ def trace(
 
 
 def _print_plan(scene: "Scene", settings: "SolverSettings", devices: list[str] | None) -> None:
-    """Print what is left to trace: batches, memory, and time by the number of workers."""
+    """Print how much remains to be traced: batches, memory, and time by the number of workers."""
     from radiotwin.trace.plan import plan_trace
 
     plan = plan_trace(scene, settings, devices)
@@ -412,7 +417,8 @@ def _settings(scene: "Scene", points_m: "np.ndarray", devices: list[str] | None,
               ) -> "SolverSettings":
     """Return solver settings of a quality, or of the cheapest quality that reaches a target [dB].
 
-    Prints error and time of each quality tried.
+    The target is for the RMS numerical error of gains; error and time of each quality that was
+    tried are printed. `others` are further fields of `SolverSettings`.
     """
     from radiotwin.runtime.pieces import keep_pieces
     from radiotwin.trace import SolverSettings, choose_quality

@@ -128,7 +128,10 @@ class CoverageGrid:
 
 @lru_cache(maxsize=2)  # a map is large
 def with_ground_as_terrain(city: CityMap) -> CityMap:
-    """Return the map with its ground faces as terrain, unless the ground is flat at the datum."""
+    """Return a 3D map whose ground triangles are terrain, so that heights count from the ground.
+
+    It is the same map if it has terrain already, or if the ground is flat at z = 0.
+    """
     if city.terrain is not None:
         return city
     ground = Surfaces([(city.vertices, city.faces)]).ground_faces()

@@ -71,7 +71,10 @@ class Legend:
     colours: tuple[str, ...]
 
     def classes(self, values: np.ndarray) -> np.ndarray:
-        """Return the class of each value, any shape; -1 for NaN. A server's class is its index."""
+        """Return the class index of each value (0: the highest class), any shape; -1 for NaN.
+
+        Values of the best-server raster are indices of transmitters, and their own classes.
+        """
         if not self.lower:
             return values.astype(np.int32)
         ends = np.asarray(self.lower[::-1], dtype=float)
@@ -80,7 +83,7 @@ class Legend:
 
 
 def legend_of(name: str, coverage: Coverage) -> Legend:
-    """Return the classes of a raster, by its name among `drawn_rasters`."""
+    """Return a raster's legend: title, and lower ends, labels and colours of its classes."""
     if name == "best_server":
         palette = colormaps[SERVER_COLOURS].colors  # type: ignore[attr-defined]
         both = [*range(0, len(palette), 2), *range(1, len(palette), 2)]  # strong before pale

@@ -214,7 +214,7 @@ def _moved_outdoors(transmitters: list[Transmitter], scene: Scene) -> list[Trans
 
 def _grid_and_gains(source: Twin | RadioMap | str, scene: Scene, transmitters: list[Transmitter],
                     settings: CoverageSettings) -> tuple[CoverageGrid, GainSource]:
-    """Return the grid of cells, and the model of the gains there."""
+    """Return the grid of cells, and the source of gains from the transmitters to them."""
     if isinstance(source, RadioMap):
         for name, value in (("step", settings.step_m), ("extent", settings.extent_m)):
             if value is not None:
@@ -266,7 +266,12 @@ def _noise_figure_db(scene: Scene, settings: CoverageSettings) -> float:
 def _rasters(gains: GainSource, scene: Scene, transmitters: list[Transmitter], grid: CoverageGrid,
              settings: CoverageSettings, noise_dbm: float,
              bandwidth_hz: float) -> dict[str, np.ndarray]:
-    """Predict all cells in blocks of rows; return the variables (ny, nx) by name."""
+    """Predict power, best server, SNR, SINR, rate and probability; return rasters (ny, nx) by name.
+
+    Cells inside buildings are predicted only with an indoor loss. Where nothing is received, best
+    server is -1 and levels are NaN. A model without standard deviations has no rasters of standard
+    deviation and coverage probability.
+    """
     frequencies_hz = sorted({each.frequency_hz or 0.0 for each in transmitters})
     overlap = channel_overlap(np.array(frequencies_hz), bandwidth_hz, settings.aclr_db)
     shape, ground = grid.shape, with_ground_as_terrain(scene.city)
@@ -325,7 +330,7 @@ def _dataset(values: dict[str, np.ndarray], transmitters: list[Transmitter], gri
 
 
 def _some_receivers(dataset: xr.Dataset, grid: CoverageGrid, scene: Scene) -> np.ndarray:
-    """Sample at most `NOTED_RECEIVERS` outdoor cells; return receiver positions (n, 3) [m]."""
+    """Take every n-th outdoor cell, `NOTED_RECEIVERS` at most; return positions (n, 3) [m]."""
     outside = np.flatnonzero(~dataset["indoor"].values)
     chosen = outside[::max(1, -(-len(outside) // NOTED_RECEIVERS))]
     y_m, x_m = (axis[rows] for axis, rows in zip((grid.y_m, grid.x_m),

@@ -52,7 +52,7 @@ class GainSource:
 
 
 def source_over(model: str, scene: Scene, transmitters: Sequence[Transmitter]) -> GainSource:
-    """Return the levels of a model that needs no measurements.
+    """Return the gain source of a model that needs no measurements; receivers are isotropic.
 
     Args:
         model: name of a published law, or `paths`, which follows paths over the map.
@@ -80,7 +80,7 @@ def source_over(model: str, scene: Scene, transmitters: Sequence[Transmitter]) -
 
 def _source_of_law(kind: type[PublishedLaw], city: CityMap,
                    transmitters: Sequence[Transmitter]) -> GainSource:
-    """Return levels of a published law, plus each antenna's gain along the straight line."""
+    """Return a source of gains: a published law, plus the antenna's gain towards the receiver."""
     device_m = np.array([each.position_m for each in transmitters])
 
     def links(receiver_m: np.ndarray, frequency_hz: float | None, row: int) -> LinkGeometry:
@@ -113,7 +113,7 @@ def _source_of_law(kind: type[PublishedLaw], city: CityMap,
 
 
 def _source_of_paths(city: CityMap, transmitters: Sequence[Transmitter]) -> GainSource:
-    """Return levels as the power sum of all paths, each weighted by the antenna; no fit."""
+    """Return a source of gains: the sum of all paths' powers, each weighted by the antenna."""
     def predict(row: int, receiver_m: np.ndarray, index: np.ndarray) -> Levels:
         each = transmitters[row]
         parts = [np.empty(0)]
@@ -145,11 +145,11 @@ def _source_of_paths(city: CityMap, transmitters: Sequence[Transmitter]) -> Gain
 
 
 def source_of_twin(twin: Twin, scene: Scene, transmitters: Sequence[Transmitter]) -> GainSource:
-    """Return the levels of a twin, for its devices and for new transmitters.
+    """Return the gain source of a twin, for its devices and for new transmitters.
 
-    New transmitters get the law of all devices, plus their antenna's gain along the straight line.
-    Declared powers and antennas of the twin's devices were subtracted before the law was learnt, so
-    they may be declared anew. An undeclared antenna of a device is part of the learnt levels.
+    A new transmitter gets the twin's general law, plus its antenna's gain along the straight line.
+    Powers and antennas that were declared for a device were subtracted before the twin was fitted,
+    so others may be declared now. An undeclared antenna is part of the learnt levels, and stays.
 
     Args:
         twin: learnt in the scene.
@@ -262,7 +262,7 @@ def _notes_of_twin(twin: Twin, transmitters: Sequence[Transmitter], rows: list[i
 
 def source_of_map(radio_map: RadioMap, level: int,
                   transmitters: Sequence[Transmitter]) -> GainSource:
-    """Return the levels of a radio map at one altitude, with the antennas of that map.
+    """Return the gain source of a radio map at one altitude; its gains include its antennas.
 
     Args:
         radio_map: of the scene.
@@ -289,7 +289,7 @@ def source_of_map(radio_map: RadioMap, level: int,
 
 
 def twin_transmitters(twin: Twin, declared: Sequence[Transmitter]) -> list[Transmitter]:
-    """Return the located devices of a twin as transmitters, with declarations of that name."""
+    """Return a twin's located devices as transmitters, with what `declared` has for their names."""
     by_name = {each.name: each for each in declared}
     return [replace(by_name.get(each.device, Transmitter(each.device, np.empty(0))),
                     position_m=np.array(each.position_m, dtype=float))
@@ -297,7 +297,7 @@ def twin_transmitters(twin: Twin, declared: Sequence[Transmitter]) -> list[Trans
 
 
 def filled_in_from_twin(twin: Twin, transmitters: Sequence[Transmitter]) -> list[Transmitter]:
-    """Fill in radio settings that a transmitter lacks and the twin's device of that name has."""
+    """Return transmitters, with missing radio settings from the twin's device of the same name."""
     radio_of = dict(zip((each.device for each in twin.devices), twin.declared.radios))
     return [replace(each, **{name: getattr(radio_of[each.name], name) for name in (
         "tx_power_dbm", "cable_loss_db", "antenna", "frequency_hz") if getattr(each, name) is None})
@@ -305,7 +305,7 @@ def filled_in_from_twin(twin: Twin, transmitters: Sequence[Transmitter]) -> list
 
 
 def altitude_row(radio_map: RadioMap, height_m: float | None) -> int:
-    """Return the index of a height [m] among a map's altitudes; of the lowest for None.
+    """Return the index of the altitude `height_m` [m] in a radio map; None: 0, the lowest.
 
     Raises:
         BadInput: the map has no such altitude.

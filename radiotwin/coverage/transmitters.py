@@ -74,7 +74,7 @@ def read_transmitters(path: Path | str, scene: Scene) -> list[Transmitter]:
         The transmitters in the order of the table.
 
     Warns:
-        A column is not used, or a value is implausible.
+        A column is not used, or a position is implausible.
 
     Raises:
         BadInput: names file, row and column of the first value that cannot be used.
@@ -125,11 +125,11 @@ def select(transmitters: list[Transmitter], names: list[str] | None) -> list[Tra
 
 def with_powers(transmitters: list[Transmitter], scene: Scene,
                 tx_power_dbm: float | None) -> list[Transmitter]:
-    """Fill in the transmit power of transmitters that do not declare it.
+    """Return transmitters with a transmit power, a default one where they declare none.
 
     Args:
-        transmitters: to complete.
-        scene: declares the transmit power if `tx_power_dbm` is None.
+        transmitters: with or without a power.
+        scene: its declared power is the default if `tx_power_dbm` is None.
         tx_power_dbm: default transmit power [dBm].
 
     Raises:
@@ -153,7 +153,10 @@ def with_powers(transmitters: list[Transmitter], scene: Scene,
 
 
 def _positions(path: Path, sites: SiteTable, scene: Scene) -> tuple[np.ndarray, list[str]]:
-    """Return positions (k, 3) in the scene's frame [m], and notes on implausible ones."""
+    """Return positions (k, 3) in the scene's frame [m], and notes on implausible ones.
+
+    Implausible: over 100 km from the map's middle, or all more than 200 m above the ground.
+    """
     names, values = sites.names, sites.values
 
     def named(row: int) -> str:

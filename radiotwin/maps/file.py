@@ -229,7 +229,7 @@ def is_map(path: Path | str) -> bool:
 
 
 def with_cf(dataset: xr.Dataset) -> xr.Dataset:
-    """Add the CF attributes, and the grid mapping where the origin is known."""
+    """Return a copy with CF attributes, and with a grid mapping if the frame's origin is known."""
     dataset = dataset.copy().assign_attrs(Conventions=CONVENTIONS)
     for name in ("x", "y", "z"):
         dataset[name] = dataset[name].assign_attrs(_CF_ATTRIBUTES[name])
@@ -245,7 +245,7 @@ def with_cf(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def without_cf(dataset: xr.Dataset) -> xr.Dataset:
-    """Remove the CF attributes that only files have."""
+    """Return the map without the CF attributes that only its file needs."""
     dataset = dataset.drop_vars(GRID_MAPPING, errors="ignore")
     dataset.attrs.pop("Conventions", None)
     for name in dataset.variables:
@@ -363,7 +363,7 @@ def _part_problem(name: str, values: np.ndarray) -> str | None:
 
 
 def _regions(values: xr.DataArray) -> Iterator[tuple[slice, ...]]:
-    """Cut an array into slices of whole chunks of its file; small chunks are joined."""
+    """Cut an array into slices of whole chunks of its file, joined up to `BLOCK_VALUES` values."""
     encoding: dict[Any, Any] = values.encoding
     stored = encoding.get("chunks") or encoding.get("chunksizes") or (1,) * values.ndim
     step = [min(part, size) for part, size in zip(stored, values.shape)]
@@ -424,7 +424,7 @@ def _write_zarr(top: xr.Dataset, dtypes: dict[str, np.dtype], blocks: Iterable[M
 
 @contextmanager
 def _open_zarr(path: Path) -> Iterator[xr.Dataset]:
-    """Check and open a Zarr folder; values are read on access."""
+    """Check and open a Zarr folder, values read on access; warns if pieces of it are missing."""
     zarr = _require_zarr(path)
     missing = check_zarr(path, _KNOWN, MAP_STREAM_VALUES)
     if any(missing.values()):
@@ -473,7 +473,7 @@ def load_dataset(path: Path) -> xr.Dataset:
 
 @contextmanager
 def _open_unchecked(path: Path) -> Iterator[xr.Dataset]:
-    """Open a NetCDF or Zarr dataset, after checks that protect the library that reads it."""
+    """Open a NetCDF or Zarr file that cannot crash its library; the content is not checked yet."""
     if not path.exists():
         raise BadInput(f"{path} does not exist; {MAKERS} makes a radio map")
     with ExitStack() as stack:
@@ -488,7 +488,10 @@ def _open_unchecked(path: Path) -> Iterator[xr.Dataset]:
 
 
 def _checked_map(path: Path, opened: xr.Dataset, is_loaded: bool = False) -> xr.Dataset:
-    """Check an opened dataset whole; return its radio map without CF attributes and encoding."""
+    """Check an opened dataset with its values; return the radio map without CF attributes.
+
+    `is_loaded`: values are read into memory first. A dataset that is no radio map is BadInput.
+    """
     with _errors_as_bad_input(path):
         problem, dataset = form_problem(opened), opened
         if problem is None:
@@ -536,7 +539,7 @@ def check_target(path: Path | str) -> None:
 
 
 def size_of(shape: tuple[int, ...], devices: int) -> str:
-    """Describe the size of a map (z, y, x) of so many devices that is written part by part."""
+    """Say how many links, parts and gigabytes on disk a map (z, y, x) of `devices` devices has."""
     parts = list(parts_of(shape))
     values = max(math.prod(each.stop - each.start for each in part) for part in parts)
     return (f"{devices * math.prod(shape):,} links in {devices * len(parts):,} parts, of which one "

@@ -64,7 +64,7 @@ SAME_M = 1e-3  # two maps' positions may differ by this [m]
 
 
 def origin_of(attributes: dict[str, Any]) -> Origin | None:
-    """Return the origin of a map's frame from its attributes; None if they lack it."""
+    """Return the origin of a map's local frame from its attributes; None if they lack it."""
     found = {name: float(attributes[f"origin_{name}"]) for name in Origin.model_fields
              if f"origin_{name}" in attributes}
     return Origin(**found) if {"latitude_deg", "longitude_deg"} <= found.keys() else None
@@ -255,7 +255,7 @@ class MapDifference(LatticeData):
         return (DIFFERENCE,)
 
     def _look(self, values: np.ndarray) -> tuple[str, str, dict[str, Any]]:
-        """Return title, label and colours; red: the first map has more gain."""
+        """Return a plot's title, bar label and colours; red where the first map has more gain."""
         high_db = residual_range_db(values)
         names = " − ".join(plain(self.dataset.attrs[each], 40) or "map"
                            for each in ("minuend", "subtrahend"))
@@ -264,6 +264,7 @@ class MapDifference(LatticeData):
 
     @property
     def _summary(self) -> Summary:
+        """Describe the difference in one line and a table: maps, devices, links, RMS, mean [dB]."""
         known = int(np.isfinite(self.difference_db).sum())
         names = " − ".join(self.dataset.attrs[each] or "map" for each in ("minuend", "subtrahend"))
         return Summary(
@@ -397,6 +398,7 @@ class RadioMap(LatticeData):
 
     @property
     def _summary(self) -> Summary:
+        """Describe the map in one line and a table; its values are read block by block."""
         levels, rows, columns = self.lattice.shape
         source = str(self.attributes.get("source", "")) or "unknown source"
         size = f"{columns} × {rows} × {levels} positions (x, y, z)"

@@ -76,7 +76,7 @@ class FlightGrid:
                 if 0 <= row < rows and 0 <= column < columns and self.allowed[row, column]]
 
     def path(self, start: Cell, end: Cell, rng: np.random.Generator) -> list[Cell]:
-        """Draw a shortest path at random; return its cells after the start, none if unreachable."""
+        """Choose a shortest path at random; return its cells after `start`. There must be one."""
         steps, cells, cell = self.steps_to(end), [], start
         while steps[tuple(cell)] > 0:
             nearer = [n for n in self.neighbours(cell) if steps[n] < steps[tuple(cell)]]
@@ -91,16 +91,16 @@ NLOS_LAW = LogDistanceLine(-35.0, 3.04, 5**0.5)
 
 
 def segmented_truth(scene: Scene | Path | str) -> RadioMap:
-    """Compute mean gain and shadowing of the segmented law over a scene's lattice, with antennas.
+    """Compute a scene's statistical truth: log-distance laws with and without LoS, and shadowing.
 
-    The mean is not censored at the sensitivity, since a survey draws the shadowing before it
-    decides what is detected.
+    Mean gains include the antennas. They are not censored at the sensitivity, since a survey draws
+    the shadowing before it decides what is detected.
 
     Args:
         scene: city, devices and lattice.
 
     Returns:
-        A map with `sigma_db`.
+        A radio map with the shadowing's standard deviation as `sigma_db` [dB].
     """
     scene = Scene.of(scene)
     receiver_m = scene.lattice.positions_m
@@ -182,7 +182,7 @@ def _require_possible(scene: Scene, truth: RadioMap) -> None:
 
 def random_waypoint(grid: FlightGrid, start: Cell, battery: float, rng: np.random.Generator
                     ) -> list[Cell]:
-    """Fly straight to random cells while the battery suffices for one more and the way home."""
+    """Return the cells of a flight to random cells by shortest ways, and home in time."""
     cells = [start]
     while True:
         left = battery - MOVE_COST * (len(cells) - 1)
@@ -197,7 +197,7 @@ def random_waypoint(grid: FlightGrid, start: Cell, battery: float, rng: np.rando
 
 def lawnmower(grid: FlightGrid, start: Cell, battery: float, rng: np.random.Generator
               ) -> list[Cell]:
-    """Fly parallel lanes, as close together as the battery allows; direction and order random."""
+    """Return the cells of a flight in parallel lanes, as close together as the battery allows."""
     cells = [start]
     for corner in _lane_ends(grid.allowed.shape, battery, rng):
         if grid.steps_home(corner) == UNREACHABLE:
@@ -210,7 +210,10 @@ def lawnmower(grid: FlightGrid, start: Cell, battery: float, rng: np.random.Gene
 
 
 def _lane_ends(shape: tuple[int, ...], battery: float, rng: np.random.Generator) -> list[Cell]:
-    """Return both ends of each lane, in the order of the flight."""
+    """Return the end cells of a lawnmower's lanes, in the order of the flight.
+
+    Direction, offset and order of the lanes are random; the battery decides how many there are.
+    """
     along = int(rng.integers(2))  # axis that lanes run along
     lane_length, width = shape[along], shape[1 - along]
     lanes_affordable = max(int(battery / MOVE_COST // lane_length), 2)

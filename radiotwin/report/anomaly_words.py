@@ -46,6 +46,9 @@ RANGES = {"azimuth_deg": "at azimuths", "elevation_deg": "at elevations",
 def where(report: dict) -> str:
     """Describe the anomalies of a close-loop with their likeliest causes; empty if there are none.
 
+    An anomaly is a group of links that reads otherwise than its peers. Groups beyond
+    `MAX_SENTENCES` are only counted.
+
     Args:
         report: content of `closeloop.json`.
     """
@@ -59,7 +62,10 @@ def where(report: dict) -> str:
 
 
 def sentence(anomaly: dict, report: dict) -> str:
-    """Compare the links of an anomaly with its peers: "Device d3 reads 5.6 dB less than …"."""
+    """Say how a group of links differs from its peers: "Device d3 reads 5.6 dB less than …".
+
+    The verb is preceded by "probably" if the group's probability is below `MIN_SURE`.
+    """
     start, is_plural = group(anomaly, origin_of(report))
     maybe = "" if anomaly["probability"] >= MIN_SURE else "probably "
     over = [OVER[each] for each in anomaly.get("same_over", [])]
@@ -69,11 +75,11 @@ def sentence(anomaly: dict, report: dict) -> str:
 
 
 def causes_sentence(anomaly: dict, named: Sequence[dict]) -> str:
-    """Name the likeliest causes of an anomaly: "Cause: …", or "Its cause is open: …".
+    """Name the causes of an anomaly: "Cause: …", or "Its cause is open: …" and the likeliest ones.
 
     Args:
-        anomaly: entry of `anomalies`.
-        named: entries of `effects` that explain it; none: the cause is open.
+        anomaly: entry of `anomalies`; its causes less probable than `LIKELY` are left out.
+        named: effects in the final model that explain the anomaly; none: the cause is open.
     """
     found = [each for each in anomaly.get("causes", []) if (each["probability"] or 0) >= LIKELY]
     likely = {each["name"] for each in found}
@@ -88,36 +94,37 @@ def causes_sentence(anomaly: dict, named: Sequence[dict]) -> str:
 
 
 def _named(index: int, report: dict) -> list[dict]:
-    """Return the effects of a report that explain the anomaly of an index."""
+    """Return the effects of a report that explain the anomaly with this index."""
     return [each for each in report["effects"] if index in each.get("anomalies", [])]
 
 
 def cause(name: str, members: Collection[str]) -> str:
-    """Return a cause in words, in its form for a device or for a receiver.
+    """Describe a cause in words; some causes have other words for a receiver than for a device.
 
     Args:
-        name: of the effect.
-        members: ends that the anomaly has members of, such as `device`.
+        name: of the effect, or of a hypothesis such as `another` cause.
+        members: the kinds of ends that the anomaly names: `device`, `receiver`, `flight`.
     """
     if name in (ANOTHER, OTHER):
         return "another cause"
     if name == NONE:
         return "nothing is missing"
     forms, of_receiver = effects_named(name), "receiver" in members
-    if of_receiver != ("device" in members):  # of a device's and a receiver's form, its own
+    if of_receiver != ("device" in members):  # words for that end
         forms = [each for each in forms if each.of_receiver == of_receiver] or forms
     words = [each.in_words for each in forms if each.in_words]
     return " or ".join(dict.fromkeys(words)) or name_label(name)
 
 
 def group(anomaly: dict, origin: Origin | None = None) -> tuple[str, bool]:
-    """Name the links of an anomaly, such as "device d3 on flight f2", and tell if that is a plural.
+    """Name the links of an anomaly, such as "device d3 on flight f2"; also return if it is plural.
 
-    A place is in latitude and longitude if the origin of the frame is given, else in metres.
+    Ends that have exactly the same links are joined by "or". A place is given in latitude and
+    longitude if the origin of the local frame is known, else as x and y [m].
     """
     members = {end: names for end in ENDS if (names := anomaly["members"].get(end))}
     text = ""
-    one = anomaly["family"] in ENDS and len(members) > 1  # they have the same links
+    one = anomaly["family"] in ENDS and len(members) > 1  # ends with the same links
     for end, names in members.items():
         joined = (" or " if one else f" {JOINED[end]} ") if text else ""
         text += f"{joined}{end}{'s' * (len(names) > 1)} "
@@ -134,7 +141,7 @@ def group(anomaly: dict, origin: Origin | None = None) -> tuple[str, bool]:
 
 
 def rows(report: dict) -> list[list[str]]:
-    """Return a row of `COLUMNS` for each anomaly."""
+    """Return a table row for each anomaly: group, causes, statistic, size, interval, …."""
     found = []
     for index, each in enumerate(report.get("anomalies", [])):
         why = causes_sentence(each, _named(index, report)).partition(": ")[2].removesuffix(".")
@@ -155,7 +162,7 @@ COLUMNS = ("group", "possible causes", "statistic", "against its peers", "90 % i
 
 
 def seen_from(report: dict) -> str:
-    """Give the smallest difference that would have been found on a device, receiver or flight."""
+    """Say from which level difference on a device, receiver or flight would have been found."""
     found = [f"a {each['family']} that is {each['size']:.1f} dB off"
              for each in report.get("seen_from", [])
              if each["family"] in ENDS and each["statistic"] == "level"]
@@ -163,7 +170,10 @@ def seen_from(report: dict) -> str:
 
 
 def seen_rows(report: dict) -> list[list[str]]:
-    """Return the smallest level, scatter and share of blanks that would be found, by family."""
+    """Return the smallest deviations that would be found, a row for each family of groups.
+
+    Columns: family (such as device), level, scatter, and share of readings that are blank.
+    """
     sizes: dict[str, dict[str, str]] = {}
     for each in report.get("seen_from", []):
         sizes.setdefault(each["family"], {})[each["statistic"]] = size({"size": each | {
@@ -173,7 +183,7 @@ def seen_rows(report: dict) -> list[list[str]]:
 
 
 def size(anomaly: dict) -> str:
-    """Return the size of an anomaly with its unit."""
+    """Return the deviation of an anomaly from its peers, with its unit; a dash if not known."""
     found = anomaly["size"]
     value, unit = found["value"], found["unit"]
     if value is None:
@@ -188,7 +198,7 @@ def size(anomaly: dict) -> str:
 
 
 def interval(found: dict) -> str:
-    """Return the 90 % interval of an anomaly's size, without the unit."""
+    """Return the 90 % interval of an anomaly's deviation, without unit; a share in percent."""
     low, high = found["low"], found["high"]
     if None in (low, high):
         return "–"
@@ -200,7 +210,7 @@ def interval(found: dict) -> str:
 
 
 def _predicate(anomaly: dict, report: dict, is_plural: bool) -> str:
-    """Return the predicate: "reads 5.6 dB (5.1 to 6.1) less than the seven others"."""
+    """Say how a group deviates: "reads 5.6 dB (5.1 to 6.1) less than the seven others"."""
     found, peers = anomaly["size"], _peers(anomaly, report, is_plural)
     value, end = found["value"] or 0.0, "" if is_plural else "s"
     is_less = value < 0
@@ -246,7 +256,7 @@ def _in_brackets(low: float | None, high: float | None, digits: int = 1) -> str:
 
 
 def _ranges(anomaly: dict) -> list[tuple[str, Sequence[float | None]]]:
-    """Return the ranges that limit an anomaly; x and y together as `place`."""
+    """Return name and limits of each range of an anomaly; those of x and y as one, `place`."""
     ranges = dict(anomaly.get("ranges") or {})
     found = []
     if "x_m" in ranges and "y_m" in ranges:
@@ -255,7 +265,7 @@ def _ranges(anomaly: dict) -> list[tuple[str, Sequence[float | None]]]:
 
 
 def _range(name: str, *ends: Any, origin: Origin | None) -> str:
-    """Put a range into words: "at distances of 100 to 300 m"."""
+    """Put a range into words: "at distances of 100 to 300 m"; None: open at that end."""
     if name == "place" and origin:
         west_m, east_m, south_m, north_m = ends
         middle = place_words((west_m + east_m) / 2, (south_m + north_m) / 2, origin)
@@ -280,7 +290,7 @@ def _range(name: str, *ends: Any, origin: Origin | None) -> str:
 
 
 def _times(low: float | None, high: float | None) -> str:
-    """Put a range of times [s] into words; times since 1970 are dates."""
+    """Put a range of times [s] into words; times since 1970 are dates, None is an open end."""
     ends = [None if each is None else
             moment(each) if DATES_S[0] < each < DATES_S[1] else f"{_rounded(each)} s"
             for each in (low, high)]

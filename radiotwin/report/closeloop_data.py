@@ -47,9 +47,9 @@ class DrawnLinks(Links):
         return np.stack([self.device_m[self.device], self.receiver_m], axis=1)
 
     def on_axis(self, name: str, value: np.ndarray) -> tuple[np.ndarray, str]:
-        """Convert a variable (n,) to the unit of its axis, and return the axis label.
+        """Return a variable (n,) as a plot's axis shows it, and the label of that axis.
 
-        Times count from the first measurement, in days, hours or seconds.
+        Only `time_s` is converted: to time since the first measurement, in days, hours or seconds.
         """
         label, unit = variable_label(name)
         if name == "time_s":
@@ -64,7 +64,7 @@ class DrawnLinks(Links):
 
 @dataclass(frozen=True, eq=False)
 class EffectData:
-    """An effect with the predictions without and with it; all other effects stay.
+    """An effect that was found, with levels predicted without and with it; all others stay.
 
     Attributes:
         found: the effect with its parameters.
@@ -84,12 +84,12 @@ class EffectData:
 
     @property
     def contribution_db(self) -> np.ndarray:
-        """Return the (n,) change of the predicted level [dB]."""
+        """Return the (n,) change of the predicted level by the effect [dB]."""
         return self.with_db - self.without_db
 
     @property
     def residual_db(self) -> np.ndarray:
-        """Return the (n,) residual without the effect [dB]."""
+        """Return the (n,) measured minus predicted level without the effect [dB]."""
         return self.links.level_db - self.without_db
 
     @property
@@ -99,7 +99,7 @@ class EffectData:
 
     @property
     def member_kind(self) -> str:
-        """Return `device` or `receiver` if each of them has parameters, else ``""``."""
+        """Return `device` or `receiver` if each has effect parameters of its own, else ``""``."""
         if "devices" in dict(self.found.params):
             return "device"
         return "receiver" if self.found.of_receiver else ""
@@ -108,14 +108,19 @@ class EffectData:
     def shown(self) -> np.ndarray:
         """Return the (n,) mask of detected links to draw.
 
-        For an effect of receivers these are links with line of sight, if there are enough.
+        An effect on receivers is drawn on links with line of sight alone, if at least
+        `MIN_LOS_LINKS` have it.
         """
         detected = np.isfinite(self.residual_db)
         clear = detected & self.links.los
         return clear if self.found.of_receiver and clear.sum() >= MIN_LOS_LINKS else detected
 
     def panels(self) -> list[tuple[str, np.ndarray]]:
-        """Return a title and row numbers of links for each panel: members that change most."""
+        """Return title and link indices of each panel: for devices or receivers changed most.
+
+        They are ranked by the standard deviation of the effect's contribution on their links. An
+        effect without parameters for each end has a single panel, of all links.
+        """
         shown, kind = self.shown, self.member_kind
         if not kind:
             return [("all links", np.flatnonzero(shown))]
@@ -137,7 +142,7 @@ class LoopData:
         links: measured links, with the devices where the final model has them.
         base: name of the base model.
         before_db: (n,) held-out prediction of the base alone [dB]; NaN: none.
-        after_db: (n,) the same with all effects, as a map has them [dB].
+        after_db: (n,) held-out prediction with all effects that a map can contain [dB].
         changed: whether anything was added to the base.
         kept: names of the candidates that were kept, in order, without what belongs to the base.
         drivers: variables that the residual depends on, those before the effects first.
@@ -157,12 +162,12 @@ class LoopData:
 
 
 def collect(loop: Loop) -> LoopData:
-    """Collect the data of the figures from a close-loop."""
+    """Collect what figures draw from a finished close-loop: links, predictions, kept effects."""
     model = loop.after
     links = _links(model.whole, loop.before.held_out_mean_db)
     before = loop.dependences_before
     dependences = [*significant(before, loop.criteria), *loop.remaining]
-    in_base = sum(each.is_declared for each in model.whole.effects)  # they come first
+    in_base = sum(each.is_declared for each in model.whole.effects)  # declared ones are kept first
     interpolated_db = None
     if model.whole.shadowing:
         interpolated_db = model.held_out_shadowing[0] * model.held_out_scales[0]
@@ -175,7 +180,10 @@ def collect(loop: Loop) -> LoopData:
 
 
 def _links(model: Fit, predicted_db: np.ndarray) -> DrawnLinks:
-    """Return the links of a fit; devices that it could not place get NaN."""
+    """Return a fit's links to draw; devices that the fit could not locate are at NaN.
+
+    `predicted_db` (n,) [dB] is among the variables that residuals are drawn over.
+    """
     links, device_m = model.links, model.links.device_m.copy()
     device_m[links.device[~model.usable]] = np.nan
     drawn = links.with_devices(device_m).with_los(links.los)
@@ -185,7 +193,10 @@ def _links(model: Fit, predicted_db: np.ndarray) -> DrawnLinks:
 
 
 def _effects(loop: Loop, links: DrawnLinks) -> list[EffectData]:
-    """Predict all links with and without each effect, by the model fitted to all links."""
+    """Predict all links with all effects, and once without each, by the model fitted to all links.
+
+    Links to a device that the model could not locate get NaN.
+    """
     whole = loop.after.whole
     if not whole.effects:
         return []
@@ -215,9 +226,9 @@ class BinMeans:
 
 
 def bin_index(value: np.ndarray, count: int) -> np.ndarray:
-    """Sort finite values (n,) into bins of about equal counts, and return their bins (n,).
+    """Return the bin (n,) of each finite value, for `count` bins with about as many values each.
 
-    Up to `count` distinct values have a bin each.
+    If there are no more than `count` distinct values, each of them is a bin.
     """
     values = np.unique(value)
     if len(values) <= count:
@@ -228,9 +239,15 @@ def bin_index(value: np.ndarray, count: int) -> np.ndarray:
 
 def bin_means(index: np.ndarray, value: np.ndarray, residual_db: np.ndarray,
               block: np.ndarray) -> BinMeans:
-    """Average residuals of links (n,) over bins; bins of fewer than `MIN_LINKS` are left out.
+    """Average the residuals of links (n,) in each bin; bins of fewer than `MIN_LINKS` drop out.
 
-    Links of one block have a common error: they count as one observation in the standard error.
+    Links of one block share an error, so a block is one observation in the standard error.
+
+    Args:
+        index: (n,) bin of each link.
+        value: (n,) variable that was binned; its mean is where a bin is drawn.
+        residual_db: (n,) what is averaged [dB].
+        block: (n,) index of each link's block.
     """
     count = np.bincount(index)
     mean = np.bincount(index, weights=residual_db) / np.maximum(count, 1)

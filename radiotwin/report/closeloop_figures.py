@@ -64,15 +64,16 @@ ELSEWHERE = {"place_of_ray", "place_of_receiver", "device", "receiver", "flight"
 
 
 def effect_figure(effect: EffectData, background: MapBackground) -> Figure:
-    """Draw an effect in the figure that suits it."""
+    """Draw an effect in the figure that it names, or else the usual one for its kind (stage)."""
     kind = effect.found.figure or FIGURE_OF_STAGE.get(effect.found.stage, "")
     return FIGURES.get(kind, variable_figure)(effect, background)
 
 
 def variable_figure(effect: EffectData, background: MapBackground) -> Figure:
-    """Draw residual and contribution over the variable that explains the contribution best.
+    """Draw residual and contribution over the variable that best explains the contribution.
 
-    Where no variable explains much, the contribution is drawn on the map.
+    The contribution is the effect's change of the predicted level [dB]. If no variable explains
+    `MIN_SHARE` of its variance, it is drawn on the map instead.
     """
     name, share = _dominant_variable(effect)
     if share < MIN_SHARE:
@@ -89,7 +90,7 @@ def variable_figure(effect: EffectData, background: MapBackground) -> Figure:
 
 
 def response_figure(effect: EffectData, _: MapBackground) -> Figure:
-    """Draw readings over the level predicted without the effect."""
+    """Draw readings over the level predicted without the effect, and a linear receiver's line."""
     unit, predicted = effect.links.level_unit, effect.without_db
     figure, axes = _grid(len(effect.panels()))
     for number, (ax, (title, rows)) in enumerate(zip(axes, effect.panels())):
@@ -103,7 +104,7 @@ def response_figure(effect: EffectData, _: MapBackground) -> Figure:
 
 
 def pattern_figure(effect: EffectData, _: MapBackground) -> Figure:
-    """Draw residual and fitted pattern over the azimuth."""
+    """Draw mean residuals and the fitted antenna pattern over the azimuth, on polar axes."""
     azimuth_deg = effect.variables[AZIMUTHS[effect.member_kind or "device"]]
     figure, axes = _grid(len(effect.panels()), projection="polar")
     for ax, (title, rows) in zip(axes, effect.panels()):
@@ -133,7 +134,10 @@ def pattern_figure(effect: EffectData, _: MapBackground) -> Figure:
 
 
 def histogram_figure(effect: EffectData, _: MapBackground) -> Figure:
-    """Draw the distribution of the residuals that the effect changes, without and with it."""
+    """Draw histograms of the residual [dB] without and with the effect.
+
+    Of an effect on links without line of sight alone, only those are counted.
+    """
     rows, los = np.isfinite(effect.residual_db), effect.links.los
     nlos = effect.found.nlos_only and (rows & ~los).any()
     rows = rows & ~los if nlos else rows
@@ -155,7 +159,10 @@ def histogram_figure(effect: EffectData, _: MapBackground) -> Figure:
 
 
 def interval_figure(effect: EffectData, background: MapBackground) -> Figure:
-    """Draw the parameter of each member with its 90 % interval; undetermined ones are left out."""
+    """Draw an effect's parameter for each device or receiver as a bar with its 90 % interval.
+
+    Parameters that the data do not determine are left out; if all are, `variable_figure` is drawn.
+    """
     known = {name: each for name, each in effect.parameters.items() if each.determined}
     if not known:
         return variable_figure(effect, background)
@@ -194,7 +201,7 @@ def _draw_means(ax: Axes, effect: EffectData, rows: np.ndarray, value: np.ndarra
         rows: (r,) row numbers of the links to draw.
         value: (n,) variable of all links.
         measured_db: (n,) levels or residuals [dB].
-        fitted_db: (n,) the same as the model has them [dB].
+        fitted_db: (n,) what the model has for each of them [dB].
         label: of the measured means.
 
     Returns:
@@ -215,7 +222,7 @@ def _draw_means(ax: Axes, effect: EffectData, rows: np.ndarray, value: np.ndarra
 
 
 def _closed_curve(fitted: BinMeans) -> tuple[np.ndarray, np.ndarray]:
-    """Return azimuths [rad] and radii of a closed curve, broken where there are no links."""
+    """Return azimuth [rad] and radius of a closed polar curve; NaN where no links are."""
     azimuth_deg = np.r_[fitted.at, fitted.at[:1] + 360]
     radius = np.r_[fitted.mean, fitted.mean[:1]]
     gaps = np.flatnonzero(np.diff(azimuth_deg) > 2 * 360 / EFFECT_BINS) + 1
@@ -223,7 +230,10 @@ def _closed_curve(fitted: BinMeans) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _dominant_variable(effect: EffectData) -> tuple[str, float]:
-    """Return the variable that explains the contribution best, and the share of its variance."""
+    """Return the continuous variable that explains an effect's contribution best, and how well.
+
+    The second value is the share of the contribution's variance, averaged over the panels.
+    """
     shares = {}
     for name, value in effect.variables.items():
         if value.dtype.kind != "f" or not np.isfinite(value).any():
@@ -236,7 +246,10 @@ def _dominant_variable(effect: EffectData) -> tuple[str, float]:
 
 
 def _explained_share(value: np.ndarray, contribution_db: np.ndarray) -> float:
-    """Return the share of the variance of a contribution that lies between bins of a variable."""
+    """Return the share (0 to 1) of a contribution's variance that bins of a variable explain.
+
+    It is the variance of the bins' means over that of the contribution.
+    """
     known = np.isfinite(value)
     if not known.any() or np.var(contribution_db[known]) < 1e-12:
         return 0.0
@@ -247,7 +260,7 @@ def _explained_share(value: np.ndarray, contribution_db: np.ndarray) -> float:
 
 
 def _grid(count: int, projection: str | None = None) -> tuple[Figure, list[Axes]]:
-    """Return a figure with panels in rows of three."""
+    """Return a new figure with `count` axes, up to three in a row."""
     columns = min(max(count, 1), 3)
     rows = max(-(-count // columns), 1)
     figure = new_figure(max(3.7 * columns, 5.5), 3.4 * rows + 0.6)
@@ -257,7 +270,7 @@ def _grid(count: int, projection: str | None = None) -> tuple[Figure, list[Axes]
 
 
 def _limits(links_db: np.ndarray, means_db: np.ndarray) -> tuple[float, float]:
-    """Return the ends of an axis that shows nearly all links and all means."""
+    """Return the ends of an axis [dB] that shows 96 % of the links, and all means."""
     low, high = np.quantile(links_db, [0.02, 0.98]) if len(links_db) else (-1.0, 1.0)
     low, high = min(low, *means_db, high), max(high, *means_db, low)
     margin = 0.05 * (high - low) + 0.1
@@ -302,16 +315,17 @@ def write_closeloop_figures(loop: Loop, scene: Scene | None, report: dict,
 
 
 def waterfall_figure(report: dict) -> Figure:
-    """Draw the held-out RMSE of the base, the change by each kept effect, and the final RMSE.
+    """Draw how the held-out RMSE falls: the base model, the change by each effect, the result.
 
-    Other models of `closeloop.json` are horizontal lines, up to `MAX_LINE` times the highest bar.
+    Effects are what the base lacks and was added to it. Other models of `closeloop.json` are
+    horizontal lines, up to `MAX_LINE` times the highest bar.
     """
     error = report["error"]
     before, after = error["before"]["rmse_db"] or 0.0, rmse_after_db(error) or 0.0
     kept = [(candidate["name"], candidate["heldout_rmse_db"]) for candidate in report["candidates"]
             if candidate["kept"] and candidate["heldout_rmse_db"] is not None]
     declared = sum(effect.get("is_declared", False) for effect in report["effects"])
-    kept = kept[declared:]  # what is declared comes first: it is part of the base
+    kept = kept[declared:]  # declared effects come first: they are part of the base
     levels = [before, *(rmse_db for _, rmse_db in kept)]
     without_cause = interpolations()
     steps = [(name_label(name), name in without_cause) for name, _ in kept]
@@ -384,7 +398,10 @@ def dependence_figure(data: LoopData) -> Figure | None:
 
 
 def _draw_curves(ax: Axes, before: BinMeans, after: BinMeans, changed: bool) -> None:
-    """Draw means with their standard errors over a continuous variable."""
+    """Draw mean residuals before and after the effects over a variable, with standard errors.
+
+    If nothing was added (`changed`), only those before are drawn.
+    """
     curves = [(before, BEFORE, "before"), (after, AFTER, "after")]
     for curve, colour, label in curves if changed else curves[:1]:
         ax.fill_between(curve.at, curve.mean - curve.error, curve.mean + curve.error, color=colour,
@@ -397,7 +414,7 @@ def _draw_curves(ax: Axes, before: BinMeans, after: BinMeans, changed: bool) -> 
 
 def _draw_bar(ax: Axes, position: int, start: float, end: float, colour: str, text: str,
               alpha: float = 1.0) -> None:
-    """Draw a bar between two levels, with a text above."""
+    """Draw a bar from `start` to `end`, in either order, with a text above."""
     low, high = sorted((start, end))
     ax.bar(position, high - low, bottom=low, width=0.7, color=colour, alpha=alpha, zorder=2)
     ax.annotate(text, (position, high), xytext=(0, 3), textcoords="offset points", ha="center",

@@ -79,7 +79,7 @@ def write_closeloop_page(report: dict, folder: Path | str, title: str) -> None:
 
 
 def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
-    """Collect the variables of `closeloop_*.html`.
+    """Collect the template variables of a close-loop's part of a page (`closeloop_*.html`).
 
     Args:
         report: content of `closeloop.json`, checked.
@@ -132,7 +132,11 @@ def _only_drawn(caption: str, is_drawn: dict[str, bool]) -> str:
 
 
 def _cards(report: dict) -> list[tuple[str, str]]:
-    """Return label and value of up to four cards: verdict, RMSE, part of places, intervals."""
+    """Return label and text of up to four headline boxes of the page.
+
+    Verdict; held-out RMSE, before and after if something was added to the base; if not, the part of
+    it that repeats at a place; share of held-out readings in their 90 % intervals.
+    """
     error, cards = report["error"], [("verdict", words.verdict(report))]
     before, of = number(error["before"].get("rmse_db")), f"RMSE of {error['before']['n']:,} links"
     if words.has_additions(report):
@@ -150,7 +154,7 @@ def _cards(report: dict) -> list[tuple[str, str]]:
 
 
 def _effect(effect: dict, folder: Path) -> dict[str, Any]:
-    """Return rank, name, evidence, figure and table of parameters of an effect."""
+    """Return what the page shows of an effect: rank, name, kind, evidence, figure, parameters."""
     name, labels = effect["name"], parameter_labels(effect["name"])
     label = name_label(name)
     kind = ("interpolated, not explained" if name in interpolations() else
@@ -186,12 +190,12 @@ def _evidence(effect: dict) -> str:
 
 
 def _error_table(report: dict, kinds: tuple[str, ...]) -> Table:
-    """Return the table of errors before and after.
+    """Return the table of held-out errors before and after effects were added, by group of links.
 
     Args:
         report: content of `closeloop.json`.
-        kinds: groups with rows: `device`, `receiver`, `flight`, and `los`, which adds all links and
-            the other models.
+        kinds: groups that get rows: each `device`, `receiver`, `flight`, or class of `los`; with
+            `los` also all links together, and other models on them.
     """
     rows: list[list[str]] = []
     others = dict(islice(report["baselines"].items(), MAX_MODELS if "los" in kinds else 0))
@@ -220,7 +224,10 @@ def _error_table(report: dict, kinds: tuple[str, ...]) -> Table:
 
 
 def _candidate_table(candidates: list[dict]) -> Table:
-    """Return the log of trials: step, effect, decision, evidence; what was kept is emphasised."""
+    """Return the table of effects that were tried, with decision, probability, RMSE and evidence.
+
+    Those that are kept in the final model are emphasised.
+    """
     rows = [[c["step"], _with_variant(c), "kept" if c["kept"] else c["reason"],
              probability(c.get("probability")), number(c["heldout_rmse_db"]),
              number(c.get("evidence_nats")), number(c["heldout_nll_gain"])]
@@ -237,7 +244,7 @@ def _with_variant(candidate: dict) -> str:
 
 
 def _facts(report: dict) -> list[str]:
-    """Return the footer: version, base, held-out links, noise of repeated measurements."""
+    """Return the texts of the footer: version, base model, held-out links, noise of readings."""
     heldout, floor_db = report["heldout"], report["error"]["noise_floor_db"]
     facts = [f"radiotwin {report.get('radiotwin_version', '')}", f"base {report['base']}",
              f"{heldout['n']:,} links held out by {heldout['by']}"]

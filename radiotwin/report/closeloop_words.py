@@ -30,7 +30,7 @@ NOT_LOOKED_FOR, LACKING = "not looked for: ", "there is no "  # a reason, and ho
 
 
 def closeloop_summary(report: dict) -> str:
-    """Summarise the result of a close-loop in a few sentences: where, why, and the error.
+    """Summarise a close-loop in a few sentences: deviating links, their causes, and the error.
 
     Args:
         report: content of `closeloop.json`.
@@ -39,7 +39,10 @@ def closeloop_summary(report: dict) -> str:
 
 
 def summary(report: dict) -> list[str]:
-    """Summarise the result in paragraphs: causes, anomalies, advice; a sure cause comes first."""
+    """Summarise a close-loop in paragraphs: causes, anomalies (deviating groups of links), advice.
+
+    The causes come first if the verdict is that some were found, else the anomalies.
+    """
     why = {"effect": _effect_words, "located": _located_words, "none": _nothing_words,
            "undecided": _undecided_words}[report["verdict"]](report)
     rest = [f"{_side_by_side(each)}." for each in _largest_first(report)
@@ -53,7 +56,7 @@ def summary(report: dict) -> list[str]:
 
 
 def verdict(report: dict) -> str:
-    """Return the verdict with the causes or groups it names: "found: receiver drift"."""
+    """Return the verdict, with causes or deviating groups of links: "found: receiver drift"."""
     if report["verdict"] == "effect":
         start = "found" if is_sure(report) else "probable"
         return f"{start}: {join_names(cause_names(report))}"
@@ -64,10 +67,10 @@ def verdict(report: dict) -> str:
 
 
 def cause_names(report: dict) -> list[str]:
-    """Return the printed names of the causes that were found, with counts.
+    """Return the printed names of the causes that were found, with counts above one.
 
-    A device and a receiver that never part share a cause: "device gain offset or receiver gain
-    offset".
+    Where a device is measured by one receiver alone, the data do not tell which of them has the
+    cause: "device gain offset or receiver gain offset".
     """
     counts = Counter(" or ".join(name_label(name) for name in (
         each["name"], *(other for other in each.get("indistinguishable_from", [])
@@ -82,7 +85,7 @@ def objects(report: dict) -> list[str]:
 
 
 def _object_words(effect: dict, origin: Origin | None) -> str:
-    """Describe one cause: its members or dimensions, direction of an antenna, and place."""
+    """Describe a cause: its devices or receivers, dimensions, antenna direction, and place."""
     forms = effects_named(effect["name"])
     form = next((each for each in forms if each.variant == effect.get("variant")), None)
     words = form and form.in_words or name_label(effect["name"])
@@ -118,7 +121,7 @@ def _member(parameter: str) -> str:
 
 
 def is_changed(effect: dict, member: str) -> bool:
-    """Return whether an effect changes a member: false if its offset's interval includes 0."""
+    """Return whether an effect changes a device or receiver; not if its offset may be 0 dB."""
     offset = effect["parameters"].get(f"offset_db[{member}]")
     return offset is None or not (offset["low"] or 0.0) <= 0.0 <= (offset["high"] or 0.0)
 
@@ -126,14 +129,19 @@ def is_changed(effect: dict, member: str) -> bool:
 def is_sure(report: dict) -> bool:
     """Return whether every cause that was found has a probability of at least `MIN_SURE`.
 
-    True without a posterior; false if a cause has no probability, such as a step between flights.
+    True if no probabilities were computed at all; false if one cause has none, such as a level
+    that changes from flight to flight.
     """
     return not report["posterior"] or all(
         (each.get("probability") or 0.0) >= MIN_SURE for each in found_causes(report))
 
 
 def rivals(report: dict) -> str:
-    """Give the probabilities of the causes, and the rivals of the first cause with theirs."""
+    """Say how probable each found cause is, and what else the first of them may be.
+
+    What the first cause leaves of the probability is divided among the other hypotheses of its step
+    of the search, in proportion to theirs.
+    """
     explaining = found_causes(report)
     known = [each for each in explaining if each.get("probability") is not None]
     found = [f"{name_label(each['name'])} {probability(each['probability'])}" for each in known]
@@ -166,7 +174,7 @@ def undetectable(report: dict) -> str:
 
 
 def with_quality(report: dict) -> str:
-    """Give the RMSE with the quality of each reading as an input, which a map lacks; else empty."""
+    """State the RMSE where each reading's quality is an input, as on no map; empty if none is."""
     known = report["error"].get("after_with_quality")
     if not known:
         return ""
@@ -180,16 +188,16 @@ def side_by_side(report: dict) -> list[str]:
 
 
 def drivers(report: dict) -> list[str]:
-    """Return labels of the variables that the last residual depends on; if none, the base's."""
+    """Return labels of the variables that the final residual, or else the base's, depends on."""
     found = report["remaining"]["drivers"] or [
         each for each in report.get("dependences_before", []) if _meets_criteria(each, report)]
     return [variable_label(each["variable"])[0] for each in found[:MAX_NAMED]]
 
 
 def is_reference(parameter: dict) -> bool:
-    """Return whether a parameter is the fixed 0 dB of the member that others are compared with.
+    """Return whether a parameter is the fixed offset of 0 dB that other offsets are relative to.
 
-    Parameters in other units may be exactly 0, too, such as a coordinate.
+    It has value and interval 0. In another unit that is no reference: a coordinate may be 0.
     """
     known = parameter["value"] == parameter["low"] == parameter["high"] == 0
     return known and parameter.get("unit") == "dB"
@@ -204,7 +212,7 @@ def _meets_criteria(dependence: dict, report: dict) -> bool:
 
 
 def found_causes(report: dict) -> list[dict]:
-    """Return the effects that are causes: neither interpolation nor a part of the base."""
+    """Return the effects of a report that are causes: no interpolation, no part of the base."""
     interpolated = interpolations()
     return [each for each in report["effects"]
             if each["name"] not in interpolated and not each.get("is_declared")]
@@ -238,7 +246,7 @@ def _largest_first(report: dict) -> list[dict]:
 
 
 def _is_significant(difference_db: dict) -> bool:
-    """Return whether two receivers differ by `MIN_DIFFERENCE_DB`, and by their interval surely."""
+    """Return whether receivers differ by `MIN_DIFFERENCE_DB` or more, in an interval without 0."""
     surely = not difference_db["low"] <= 0 <= difference_db["high"]
     return surely and abs(difference_db["value"]) >= MIN_DIFFERENCE_DB
 
@@ -259,7 +267,7 @@ def _side_by_side(found: dict) -> str:
 
 
 def rmse_after_db(error: dict) -> float:
-    """Return the RMSE after [dB] over the links that have a prediction before, too."""
+    """Return the RMSE with the effects [dB], on links that have a prediction without them, too."""
     return (error.get("after_same_links") or error["after"]).get("rmse_db")
 
 
@@ -300,7 +308,10 @@ def _effect_words(report: dict) -> str:
 
 
 def _unnamed_beside(report: dict) -> float | None:
-    """Return the probability that an unnamed cause is left; None below `HALF`."""
+    """Return the probability that, beside the causes found, one outside the catalogue remains.
+
+    None unless it is the likeliest hypothesis of the last step, and at least `HALF`.
+    """
     found = report["posterior"][-1]["probabilities"] if report["posterior"] else []
     if not found or found[0]["name"] != OTHER:
         return None
@@ -308,7 +319,7 @@ def _unnamed_beside(report: dict) -> float | None:
 
 
 def _nothing_words(report: dict) -> str:
-    """Say that nothing was found, from which size on it would have been, and what error stays."""
+    """Say that no group of links deviates, which deviation would have been found, and the RMSE."""
     before_db = report["error"]["before"]["rmse_db"]
     is_same = before_db is not None and not has_additions(report)
     return " ".join(filter(None, [
@@ -320,7 +331,7 @@ def _nothing_words(report: dict) -> str:
 
 
 def _located_words(report: dict) -> str:
-    """Give the residual of an anomaly without a cause, and what would settle the cause."""
+    """Describe the residual where links deviate without a known cause, and what would settle it."""
     return " ".join(filter(None, [
         f"The {_residual_words(report)}", _not_looked_for(report), _settled_by(report)]))
 
@@ -340,14 +351,14 @@ def _not_looked_for(report: dict) -> str:
 
 
 def _residual_words(report: dict) -> str:
-    """Give the RMSE of the base's residual, and the variables that it depends on."""
+    """State the RMSE of the base model's residual [dB], and the variables that it depends on."""
     names = drivers(report)
     depends = f" and depends on {join_names(names)}" if names else ""
     return f"residual is {number(report['error']['before']['rmse_db'])} dB RMSE{depends}."
 
 
 def _undecided_words(report: dict) -> str:
-    """Give the likeliest causes where none is probable enough, and what would settle it."""
+    """Say that the verdict is undecided, with the likeliest causes and what would settle it."""
     step = next(iter(report["posterior"]), None)
     if step is None:
         return "Undecided: no cause was looked for."
@@ -377,8 +388,8 @@ def _settled_by(report: dict) -> str:
 def _settled_for(name: str, step: int, report: dict) -> str:
     """Say which measurement would settle whether an effect is there; empty if none is known.
 
-    An effect may have a form for devices and one for receivers: the form of the best candidate of
-    that step counts, and its devices or receivers are named.
+    An effect may have a form for devices and one for receivers. That of the most probable trial at
+    this step of the search is used, and its devices or receivers are named.
     """
     forms = effects_named(name)
     texts = {each.of_receiver: each.settled_by for each in reversed(forms) if each.settled_by}
@@ -403,9 +414,9 @@ def _settled_for(name: str, step: int, report: dict) -> str:
 
 
 def _likely(probabilities: list[dict], report: dict) -> str:
-    """Join the hypotheses of at least `LIKELY` with their probabilities; empty if there are none.
+    """List hypotheses that are at least as probable as `LIKELY`, with probability; else empty.
 
-    "Nothing is missing" is left out beside an anomaly.
+    "Nothing is missing" is left out if a group of links deviates, which contradicts it.
     """
     likely = [each for each in probabilities if (each["probability"] or 0) >= LIKELY
               and not (each["name"] == NONE and report.get("anomalies"))]
@@ -421,9 +432,9 @@ def _probability_in_brackets(report: dict, name: str) -> str:
 
 
 def split_db(report: dict) -> tuple[float, float] | None:
-    """Split the base's RMSE [dB] into a part that repeats at a place and a part by reading.
+    """Split the base's RMSE [dB] into what repeats at a place, and what differs between readings.
 
-    Their squares add up. None if they are not known.
+    The squares of both add up to that of the RMSE. None if they were not estimated.
     """
     step = next(iter(report["posterior"]), None)
     whole_db = report["error"]["before"]["rmse_db"]

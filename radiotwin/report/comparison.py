@@ -100,13 +100,13 @@ def compare_held_out(measurements: Measurements | pd.DataFrame | Path | str,
                      seed: int = 0, executor: Executor | None = None) -> Comparison:
     """Fit all channel models to the first flights, and compare them on the last ones.
 
-    Published laws that hold at the scene's frequency are among them, fitted to nothing.
+    Published laws that are valid at the scene's frequency are compared as well, without a fit.
 
     Args:
-        measurements: of several flights; of a file or a data frame, too.
+        measurements: of several flights, also as a file or a data frame.
         scene: where they were flown, or its folder.
-        truth: the whole map to judge on, too; None: there is none.
-        held_out: number of the last flights.
+        truth: radio map on which errors over all positions are computed, too; None: there is none.
+        held_out: number of flights, the last ones, that nothing is fitted to.
         paths: compare the model `paths`, too; takes minutes.
         also: folders of twins and, with a truth, files of radio maps, to compare with the models.
         seed: of all fits.
@@ -127,9 +127,12 @@ def compare_held_out(measurements: Measurements | pd.DataFrame | Path | str,
 
 def _judge_also(paths: list[Path], truth: RadioMap | None, held_out: list[str],
                ) -> tuple[dict[str, Twin], dict[str, RadioMap]]:
-    """Read further twins and radio maps for a comparison; their paths are their names.
+    """Read further twins and radio maps to compare with the models, each named by its path.
 
-    Warns if a twin was fitted to one of the held-out flights.
+    Warns if a twin was fitted to a flight in `held_out`, which makes its error look too small.
+
+    Raises:
+        BadInput: a radio map without a truth map, on which alone it can be judged.
     """
     twins, maps = {}, {}
     for path in paths:
@@ -150,7 +153,7 @@ def _judge_also(paths: list[Path], truth: RadioMap | None, held_out: list[str],
 
 
 def write_comparison(comparison: Comparison, scene: Scene, folder: Path | str) -> None:
-    """Write the tables of a comparison, and the name of its scene.
+    """Write the tables of a comparison as files, and the name of its scene.
 
     `compare.json`, `scores.csv`, `locations.csv` and `predictions.csv.gz`; the folder is made if
     needed, files of these names are replaced.
@@ -215,7 +218,7 @@ def write_comparison_figures(comparison: Comparison, scene: Scene, truth: RadioM
 
 
 def _typical_device(truth: RadioMap, maps: dict[str, RadioMap]) -> str:
-    """Return the device, of those in all maps, whose share of LoS positions is nearest the mean."""
+    """Return the device whose share of LoS positions is nearest the mean, of those in all maps."""
     devices = [name for name in truth.devices
                if all(name in radio_map.devices for radio_map in maps.values())]
     los = np.array([truth.los[truth.devices.index(name)].mean() for name in devices])
@@ -289,7 +292,7 @@ def comparison_context(comparison: Comparison, folder: Path) -> dict[str, Any]:
 
 
 def _tables(comparison: Comparison) -> list[tuple[str, Table]]:
-    """Return titles and tables of the errors of levels, and of the devices' positions."""
+    """Return titled tables of level errors [dB] and position errors [m], a row for each model."""
     columns = ("model", "RMSE", "RMSE LoS", "RMSE NLoS", "MAE", "bias")
     tables = []
     estimated = comparison.scores.query("positions == 'estimated'")
@@ -312,7 +315,7 @@ def _tables(comparison: Comparison) -> list[tuple[str, Table]]:
 
 
 def _judged(comparison: Comparison) -> pd.DataFrame:
-    """Return RMSE over the whole map [dB] and median position error [m] of the models."""
+    """Return a table of each model's RMSE over the truth map [dB] and median position error [m]."""
     scores = comparison.scores.query(
         "against == 'whole map' and positions == 'estimated' and links == 'all'")
     located = comparison.location_summary().set_index("model")
@@ -320,7 +323,7 @@ def _judged(comparison: Comparison) -> pd.DataFrame:
 
 
 def _summary(comparison: Comparison) -> str:
-    """Compare twin, log-distance model and the best model in words; empty without a whole map."""
+    """Compare the twin with the log-distance model and the best one; empty without a truth map."""
     judged = _judged(comparison)
     if not set(SHOWN) <= set(judged.index):
         return ""

@@ -41,7 +41,7 @@ def write_coverage_pictures(coverage: Coverage, scene: Scene, folder: Path) -> N
 
 
 def _coverage_figure(coverage: Coverage, scene: Scene, name: str, heights: HeightGrid) -> Figure:
-    """Draw a raster of `Coverage.dataset` in classes."""
+    """Draw a raster of a coverage map in classes, with buildings, transmitters and polygons."""
     legend, bounds_m = legend_of(name, coverage), coverage.grid.bounds_m
     x_min, x_max, y_min, y_max = bounds_m
     width, height = x_max - x_min, y_max - y_min
@@ -86,7 +86,10 @@ def _coverage_figure(coverage: Coverage, scene: Scene, name: str, heights: Heigh
 
 def _handles(legend: Legend, classes: np.ndarray, coverage: Coverage,
              with_buildings: bool) -> list[Patch]:
-    """Return the legend: a patch for each class with its share of the cells."""
+    """Return legend patches: each class with its share of the cells, "not detected", buildings.
+
+    Of more than `MAX_LEGEND_ROWS` classes only the most frequent are named.
+    """
     counts = np.bincount(classes[classes >= 0].astype(int), minlength=len(legend.labels))
     cells = classes.size - coverage.summary["cells_left_out_indoors"]
     shares = counts / max(cells, 1)

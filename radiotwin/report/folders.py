@@ -57,7 +57,7 @@ CONTENT = ("scene.toml, twin.json, closeloop.json, compare.json, config.json of 
 
 
 def check_closeloop_folder(folder: Path | str) -> None:
-    """Check that the result of a close-loop can be written to a folder, before it is made.
+    """Check, before a close-loop starts, that its result can be written to a folder.
 
     Raises:
         BadInput: it cannot be written, or something that no close-loop wrote would be lost.
@@ -76,7 +76,7 @@ def write_closeloop_folder(loop: Loop, scene: Scene | None, folder: Path | str, 
 
     Args:
         loop: result to write.
-        scene: it was found in; None: there was none.
+        scene: of the measurements; None: there was no 3D map.
         folder: to write; an older result in it is replaced as a whole, other files are kept.
         title: of the page.
         inputs: names of measurements and scene, for `closeloop.json`.
@@ -102,7 +102,7 @@ def write_closeloop_folder(loop: Loop, scene: Scene | None, folder: Path | str, 
 
 
 def check_comparison_folder(folder: Path | str) -> None:
-    """Check that a comparison can be written to a folder, before it is made.
+    """Check, before models are compared, that the result can be written to a folder.
 
     Raises:
         BadInput: it cannot be written, or something that no comparison wrote would be lost.
@@ -127,7 +127,7 @@ def write_comparison_folder(comparison: Comparison, scene: Scene, folder: Path |
 
 
 def check_map_target(path: Path | str, scene: Scene) -> None:
-    """Check that a map of a scene can be written under a file name, before it is made.
+    """Check, before a radio map is computed, that it can be written under a file name.
 
     Raises:
         BadInput: an unknown format, one that needs an origin where the scene has none, or a file
@@ -147,18 +147,18 @@ def export_map(source: RadioMap | Twin, scene: Scene | Path | str, path: Path | 
 
     Args:
         source: map, or twin whose map is written.
-        scene: that it was made for.
+        scene: that the map or twin was made for.
         path: file to write; its suffix chooses the format.
         devices: names, in the order wanted; None: all.
         altitudes_m: altitudes of the lattice [m]; None: all.
-        name: of the source in messages.
-        tell: called with the size of a Zarr map of over `TOLD_LINKS` before it is written.
+        name: what messages call the source.
+        tell: called before a Zarr map of over `TOLD_LINKS` is written, with a text on its size.
 
     Returns:
         What was written.
 
     Raises:
-        BadInput: as `check_map_target`, a map of another place, or no such device or altitude.
+        BadInput: see `check_map_target`; or a map of another place, no such device or altitude.
     """
     path, scene = Path(path), Scene.of(scene)
     check_map_target(path, scene)
@@ -264,7 +264,7 @@ def read_run(folder: Path | str, scene: Path | None = None, truth: str | None = 
 
 
 def _first(folder: Path, *names: str) -> Path | None:
-    """Return the first of these files (or .zarr folders) that exists.
+    """Return the first of the named files (or .zarr folders) that a folder holds; else None.
 
     Raises:
         BadInput: a link leads out of the folder.
@@ -275,7 +275,10 @@ def _first(folder: Path, *names: str) -> Path | None:
 
 
 def _scene(run: Run, given: Path | None, named: str | None) -> Scene | None:
-    """Load the scene that is given, lies in the run's folder, or is named by the run; else None."""
+    """Load a run's scene: the one given, the one in its folder, or the one it names; else None.
+
+    Without a scene, `run.notes` gets the reason.
+    """
     if given is not None:
         return Scene.load(given)
     found = _first(run.folder, "scene.toml", "scene/scene.toml")
@@ -295,9 +298,10 @@ def _scene(run: Run, given: Path | None, named: str | None) -> Scene | None:
 
 
 def _read_maps(run: Run, truth: str | None) -> None:
-    """Read the truth, the twin's map and those in the folder, all over the scene's lattice.
+    """Read into `run.maps` the truth, the twin's map and those in the run's folder.
 
-    Of large maps every n-th position is read; the whole is never in memory.
+    Of large maps only every n-th position in x and y is read, so that all fit into memory;
+    `run.map_step` becomes n.
     """
     with ExitStack() as stack:
         maps = _open_maps(run, truth, stack)
@@ -310,7 +314,11 @@ def _read_maps(run: Run, truth: str | None) -> None:
 
 
 def _open_maps(run: Run, truth: str | None, stack: ExitStack) -> dict[str, RadioMap | MapStream]:
-    """Open all maps of a run by name; values are read, or predicted, later."""
+    """Open the maps of a run by name: truth, twin's map, and those in its folder; read later.
+
+    A map that is not over the scene's lattice is left out with a line in `run.notes`, or refused
+    with BadInput if it was given as `truth`.
+    """
     maps: dict[str, RadioMap | MapStream] = {}
     if truth is not None and truth != "segmented":
         given = stack.enter_context(RadioMap.open(truth))
@@ -348,7 +356,10 @@ def _open_maps(run: Run, truth: str | None, stack: ExitStack) -> dict[str, Radio
 
 
 def _tracks(run: Run, measurements: Path | None) -> pd.DataFrame | None:
-    """Read the UAVs' positions over time from `flights.csv`, measurements, or held-out links."""
+    """Read the UAVs' positions over time from `flights.csv`, measurements, or held-out links.
+
+    None if there are none of these, or if readings lack a time.
+    """
     path = _first(run.folder, "flights.csv")
     if measurements is None and path is not None:
         return read_table(path, TRACK)
@@ -372,7 +383,7 @@ def _tracks(run: Run, measurements: Path | None) -> pd.DataFrame | None:
 
 
 def _planning_settings(folder: Path) -> dict[str, Any]:
-    """Return the settings of `marl.fedqmix`; empty for any other folder."""
+    """Return the scene and truth that a planning run (`marl.fedqmix`) names; else empty."""
     path = _first(folder, "config.json")
     if path is None:
         return {}

@@ -42,9 +42,10 @@ class Pivot:
 
 def pivot(links: DrawnLinks, residual_db: np.ndarray, ends: tuple[str, str],
           anomalies: Sequence[dict]) -> Pivot:
-    """Compute median and scatter of residuals (n,) [dB] by two ends.
+    """Tabulate median and scatter of residuals (n,) [dB] by two ends, such as device and flight.
 
-    Up to `MAX_MEMBERS` of an end are kept: members of anomalies first, then large residuals.
+    Up to `MAX_MEMBERS` names of each end get a row or column: those in anomalies (deviating groups
+    of links) first, then those with the largest mean square residual.
     """
     table = pd.DataFrame({end: links.variables[end].astype(int) for end in ends} | {
         "residual_db": residual_db}).dropna()
@@ -70,10 +71,10 @@ def pivot(links: DrawnLinks, residual_db: np.ndarray, ends: tuple[str, str],
 
 
 def groups_figure(data: LoopData, report: dict) -> Figure:
-    """Draw the residual of the base by device and flight, and by receiver and flight.
+    """Draw heat maps of the held-out residual by device and flight, and by receiver and flight.
 
-    With one flight, receivers take its place. A row of panels for each pair of ends: the median,
-    and the scatter.
+    With a single flight there is one table, by device and receiver. Each has two panels: median and
+    scatter. Anomalies (deviating groups of links) are framed in the panel that shows them.
 
     Args:
         data: with the held-out prediction of the base.
@@ -115,7 +116,7 @@ def _is_part(anomaly: dict) -> bool:
 
 
 def _framed_members(anomaly: dict) -> dict[str, Sequence[str]]:
-    """Return the members of an anomaly by end; of two ends that never part, the family's."""
+    """Return an anomaly's names by end; if it is about one end (its family), that end's alone."""
     members, family = anomaly["members"], anomaly["family"]
     return {family: members[family]} if family in members else members
 
@@ -137,7 +138,7 @@ def _label(ax: Axes, found: Pivot, column: int) -> None:
 
 
 def _write_numbers(ax: Axes, values: np.ndarray, low: float, high: float) -> None:
-    """Write each cell's value into it, in white on dark colours."""
+    """Write each cell's value into it, white on dark; none if columns exceed `MAX_NUMBERS`."""
     if values.shape[1] > MAX_NUMBERS:
         return
     for (row, column), value in np.ndenumerate(values):
@@ -149,9 +150,10 @@ def _write_numbers(ax: Axes, values: np.ndarray, low: float, high: float) -> Non
 
 
 def _frame(ax: Axes, found: Pivot, members: dict[str, Sequence[str]], is_part: bool) -> None:
-    """Frame the cells of an anomaly, dashed if it holds a part of their links only.
+    """Frame the cells of an anomaly (a deviating group of links) in a heat map.
 
-    Nothing is drawn if the panel lacks one of its ends.
+    The frame is dashed if the anomaly is only a part of the cells' links (`is_part`). Nothing is
+    drawn if `members` names an end, such as receiver, that is not an axis of the panel.
     """
     if not members or not set(members) <= set(found.ends):
         return

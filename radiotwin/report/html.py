@@ -125,7 +125,7 @@ def _policy(style: Markup, scripts: Sequence[Markup]) -> str:
 
 @cache
 def _environment() -> Environment:
-    """Return the Jinja environment: everything is escaped, missing variables are errors."""
+    """Return the template engine: all values are escaped, missing variables are errors."""
     environment = Environment(
         loader=PackageLoader("radiotwin.report"), autoescape=True, undefined=StrictUndefined,
         finalize=_final, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True)

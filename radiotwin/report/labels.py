@@ -107,11 +107,11 @@ def parameter_labels(effect: str) -> dict[str, str]:
 
 
 def parameter_label(name: str, labels: Mapping[str, str] = PARAMETERS) -> str:
-    """Return the label of a parameter with its member: `tilt_deg[uav1]` -> `tilt (uav1)`.
+    """Return a parameter's label with its device or receiver: `tilt_deg[uav1]` -> `tilt (uav1)`.
 
     Args:
         name: as `closeloop.json` has it.
-        labels: of parameters without their members, see `parameter_labels`.
+        labels: by parameter without the brackets, see `parameter_labels`.
     """
     stem, bracket, member = name.partition("[")
     label = labels.get(stem) or _split_unit(stem)[0].replace("_", " ")
@@ -119,7 +119,7 @@ def parameter_label(name: str, labels: Mapping[str, str] = PARAMETERS) -> str:
 
 
 def join_names(names: list[str]) -> str:
-    """Join names as `a, b and c`, each once."""
+    """Join names as `a, b and c`, each once; no names become "no variable"."""
     names = list(dict.fromkeys(names))
     if not names:
         return "no variable"
@@ -127,7 +127,7 @@ def join_names(names: list[str]) -> str:
 
 
 def number(value: float | None) -> str:
-    """Return a number as a page shows it."""
+    """Format a number: two decimals, integers with none, small ones two digits; None as a dash."""
     if value is None:
         return "–"
     if isinstance(value, int):
@@ -209,7 +209,7 @@ def new_figure(width_in: float, height_in: float) -> Figure:
 
 def save(figure: Figure, path: Path | str) -> None:
     """Write a figure as a PNG file, completely or not at all."""
-    data = io.BytesIO()  # Pillow loses the reason of a write to a file that fails
+    data = io.BytesIO()  # Pillow hides why a write to a file failed
     figure.savefig(data, dpi=DPI, format="png", metadata={"Software": "radiotwin"})
     with atomic_file(path) as file:
         file.write(data.getbuffer())

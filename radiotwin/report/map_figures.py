@@ -74,19 +74,19 @@ def write_picture(radio_map: RadioMap, scene: Scene, path: Path | str,
                   devices: Sequence[TwinDevice] = ()) -> None:
     """Write the level of all devices at the lowest altitude as a PNG file.
 
-    It is the received power where the map knows the devices' power, else the gain.
+    Levels are received powers [dBm] if the map has all transmit powers, else gains [dB].
 
     Args:
         radio_map: map to draw.
         scene: whose buildings are outlined.
         path: PNG file.
-        devices: positions as a twin has them; those of others are the scene's.
+        devices: a twin's devices, whose estimates are marked beside the scene's positions.
     """
     save(_radio_map_figure(radio_map, scene, devices), path)
 
 
 def _radio_map_figure(radio_map: RadioMap, scene: Scene, devices: Sequence[TwinDevice]) -> Figure:
-    """Draw the level of up to `MAX_PANELS` devices at the lowest altitude, a panel for each."""
+    """Draw the level of the first `MAX_PANELS` devices at the lowest altitude, a panel for each."""
     names = radio_map.devices[:MAX_PANELS]
     radio_map = radio_map.thinned(max(-(-max(radio_map.lattice.shape[1:]) // MAX_CELLS), 1))
     level_db = radio_map.dataset["gain_db"].variable[:len(names), 0].values
@@ -141,9 +141,9 @@ def tx_powers_dbm(radio_map: RadioMap) -> np.ndarray | None:
 
 def model_maps_figure(truth: RadioMap, models: dict[str, RadioMap], scene: Scene,
                       device: str) -> Figure:
-    """Draw the truth beside models, and their errors, for one device at the lowest altitude.
+    """Draw a device's gains in the truth and in models, and the errors, at the lowest altitude.
 
-    The models' maps, by name, are over the same lattice.
+    `models` are radio maps by name, over the truth's lattice.
     """
     figure, axes = panels(2, 1 + len(models), 4.0, 4.3)
     heights = height_grid(scene, OUTLINE_CELLS)
@@ -263,9 +263,9 @@ class MapBackground:
         return width_in * min(max((y_max - y_min) / max(x_max - x_min, 1.0), 0.4), 1.3)
 
     def frame(self, positions_m: np.ndarray) -> tuple[float, float, float, float]:
-        """Return x_min, x_max, y_min, y_max [m] of a part that shows positions (n, 2) [m].
+        """Return x_min, x_max, y_min, y_max [m] of the part of the map around positions (n, 2) [m].
 
-        It has the map's proportions.
+        It has the map's proportions. Without positions it is the whole map.
         """
         x_min, x_max, y_min, y_max = self.bounds
         if not len(positions_m):
@@ -277,7 +277,7 @@ class MapBackground:
         return middle[0] - half[0], middle[0] + half[0], middle[1] - half[1], middle[1] + half[1]
 
     def draw(self, ax: Axes) -> None:
-        """Draw buildings, the ends that do not move, and axes in metres."""
+        """Draw buildings, streets, and the links' fixed ends (devices or receivers); axes [m]."""
         x_min, x_max, y_min, y_max = self.bounds
         if self._scene is not None:
             draw_streets(ax, self._scene)
@@ -326,7 +326,10 @@ class MapBackground:
         return edges[0], edges[1], mean_db.T
 
     def _fixed_ends(self) -> list[tuple[str, str, str, list[str], np.ndarray]]:
-        """Return marker, colour, label, names and positions [m] of the fixed ends, by kind."""
+        """Return marker, colour, label, names and positions [m] of the links' fixed ends, by kind.
+
+        Kinds: receivers if devices move; else devices of declared, and of located position.
+        """
         links = self.links
         if not self.receivers_move:
             return [("s", "black", "receiver", [], np.unique(links.receiver_m.round(), axis=0))]
@@ -359,7 +362,7 @@ def mark(ax: Axes, effect: EffectData) -> None:
 
 
 def _draw_label(ax: Axes, text: str, position_m: np.ndarray) -> None:
-    """Write beside a marker, on the side of the middle of the map, where fewer ends are covered."""
+    """Write a text beside a marker, towards the middle of the map, where it hides fewer markers."""
     side = 1 if position_m[0] < np.mean(ax.get_xlim()) else -1
     point_m = np.ptp(ax.get_xlim()) / (72 * (PANEL_IN - 0.7))
     lines = text.split("\n")
@@ -378,12 +381,12 @@ def _draw_label(ax: Axes, text: str, position_m: np.ndarray) -> None:
 
 
 def residual_map_figure(data: LoopData, background: MapBackground, report: dict) -> Figure:
-    """Draw the mean held-out residual by the moving end's position, before and after.
+    """Draw maps of the mean held-out residual in cells, before and after the effects.
 
     Args:
-        data: of the loop.
-        background: map.
-        report: content of `closeloop.json`; what it names is marked.
+        data: links and predictions of a close-loop.
+        background: map under the residuals.
+        report: content of `closeloop.json`, whose anomalies and causes are marked.
     """
     panels = [(f"before: {name_label(data.base)}", data.before_db)]
     if data.changed:
@@ -391,7 +394,7 @@ def residual_map_figure(data: LoopData, background: MapBackground, report: dict)
         added = join_names(names) if len(names) < 3 else f"{len(names)} effects"
         panels.append((f"after: with {added}", data.after_db))
     residuals_db = [data.links.level_db - predicted_db for _, predicted_db in panels]
-    has_before = np.isfinite(residuals_db[0])  # errors that are said together are of the same links
+    has_before = np.isfinite(residuals_db[0])  # for both RMSEs: of the same links
     cells = [background.cell_means(residual_db) for residual_db in residuals_db]
     axes = background.panels(len(panels))
     range_db = residual_range_db(cells[0][2])
@@ -407,7 +410,7 @@ def residual_map_figure(data: LoopData, background: MapBackground, report: dict)
 
 
 def _frame_places(ax: Axes, anomalies: Sequence[dict]) -> None:
-    """Frame the rectangles of anomalies of the family `place`, dashed."""
+    """Draw a dashed frame around each place whose links deviate (anomalies of family `place`)."""
     label: str | None = "links at or through it stand out"
     for each in anomalies:
         if each["family"] == "place":
@@ -419,7 +422,7 @@ def _frame_places(ax: Axes, anomalies: Sequence[dict]) -> None:
 
 
 def _ring_devices(ax: Axes, links: DrawnLinks, report: dict) -> None:
-    """Ring the devices of anomalies and of causes."""
+    """Draw a ring around each device that an anomaly or a found cause is about."""
     named = {name for each in report.get("anomalies", [])
              for name in each["members"].get("device", ())}
     named |= {place["device"] for effect in found_causes(report)
@@ -432,7 +435,7 @@ def _ring_devices(ax: Axes, links: DrawnLinks, report: dict) -> None:
 
 
 def level_map_figure(data: LoopData, background: MapBackground) -> Figure | None:
-    """Draw measured and predicted held-out levels and their difference over the moving end.
+    """Draw maps of measured level, held-out prediction and their difference, averaged in cells.
 
     Returns:
         the figure; None where no detected link has a held-out prediction
@@ -461,7 +464,7 @@ def level_map_figure(data: LoopData, background: MapBackground) -> Figure | None
 
 
 def contribution_map_figure(contribution_db: np.ndarray, background: MapBackground) -> Figure:
-    """Draw an effect's contribution to the levels (n,) [dB] by the moving end's position."""
+    """Draw a map of an effect's change of the levels (n,) [dB], averaged in cells."""
     (ax,) = background.panels(1)
     grid = background.cell_means(contribution_db)
     range_db = residual_range_db(grid[2])
@@ -473,7 +476,8 @@ def contribution_map_figure(contribution_db: np.ndarray, background: MapBackgrou
 def affected_links_figure(effect: EffectData, background: MapBackground) -> Figure:
     """Draw the links that an effect changes as lines in the colour of their residual.
 
-    Left without the effect, right with it.
+    Left without the effect, right with it. Changes up to `MIN_CONTRIBUTION_DB` do not count. Of
+    many links `MAX_RAYS` are drawn, at random with a fixed seed, so that a figure can be repeated.
     """
     links = effect.links
     changed = np.abs(effect.contribution_db) > MIN_CONTRIBUTION_DB
@@ -505,7 +509,7 @@ def affected_links_figure(effect: EffectData, background: MapBackground) -> Figu
 
 def _draw_cells(ax: Axes, grid: tuple[np.ndarray, np.ndarray, np.ndarray], colours: str,
                 low: float, high: float, label: str) -> None:
-    """Draw the result of `MapBackground.cell_means` in colour, and the legends."""
+    """Draw cells in colour (`grid`: edges in x and in y [m], values (ny, nx)), with the legends."""
     image = ax.pcolormesh(*grid, cmap=colours, vmin=low, vmax=high, zorder=2, alpha=0.9,
                           linewidth=0, rasterized=True)
     _draw_legends(ax, image, label)

@@ -77,7 +77,7 @@ def _origin(run: Run) -> Origin | None:
 
 
 def _located_words(run: Run) -> str:
-    """Say where the unknown devices are, for those within `ROUGH_M`; else empty."""
+    """Say where unknown devices are, if their 90 % radius is at most `ROUGH_M`; empty if none."""
     found = [device for device in _located(run) if _is_found(device)]
     words = []
     for device in found[:MAX_NAMED]:
@@ -89,9 +89,9 @@ def _located_words(run: Run) -> str:
 
 
 def _channel_words(run: Run) -> str:
-    """Say how far off the twin's channel model is on held-out links; empty if nobody tried.
+    """State the held-out RMSE of the twin's channel model and of others; empty if not computed.
 
-    A close-loop's page has its own errors.
+    It is empty for a close-loop, whose page has errors of its own.
     """
     held_out = HeldOut.kept(run.twin.provenance) if run.twin and not run.closeloop else None
     if held_out is None or run.twin is None or run.twin.channel.name not in held_out.rmse_db:
@@ -104,7 +104,7 @@ def _channel_words(run: Run) -> str:
 
 
 def _law_table(run: Run) -> Table | None:
-    """Return the law that `fit` recorded in the twin, with its intervals; else None."""
+    """Return the table of the twin's fitted channel law; None if none, or for a close-loop."""
     if run.twin is None or run.closeloop or not run.twin.provenance.get(LAW):
         return None
     law = run.twin.params

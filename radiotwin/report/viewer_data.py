@@ -70,8 +70,8 @@ def pack_m(values: ArrayLike) -> dict:
 def map_layers(run: Run) -> list[dict]:
     """Pack level, standard deviation, line of sight and error of each radio map of a run.
 
-    Levels are received powers where the twin's measurements were. Of large maps every n-th position
-    is taken, and `run.notes` says so.
+    Levels are received powers [dBm] if the twin was fitted to such and the map has all transmit
+    powers, else gains [dB]. Of large maps every n-th position is taken, and `run.notes` says so.
     """
     step = _thinning(run)
     truth = run.maps.get(TRUTH)
@@ -107,9 +107,9 @@ def map_layers(run: Run) -> list[dict]:
 def link_layer(run: Run) -> dict | None:
     """Pack the held-out links of a close-loop; None if the run has no residuals.
 
-    A link has the position of its moving end, its residuals before and after, its measured level
-    and, for some, its paths. `interval_db` holds 90 % of the residuals of links without and with
-    line of sight. `run.notes` says where links are left out.
+    A link has the position of its moving end, its residuals before and after the effects, its
+    measured level and, for some, its paths. `interval_db` holds 90 % of the residuals: the interval
+    without line of sight, then that with it. `run.notes` says if links are left out.
     """
     links = run.residuals
     if links is None or links.empty:
@@ -148,7 +148,7 @@ def link_layer(run: Run) -> dict | None:
 def path_layer(scene: Scene, links: pd.DataFrame) -> dict:
     """Follow the strongest reflected and diffracted paths of the links with the largest residuals.
 
-    Found buildings are not in the map that they are followed over.
+    Paths are followed over the scene's map, without buildings that a close-loop found.
 
     Args:
         scene: 3D map and carrier frequency.
@@ -233,9 +233,9 @@ def found_layer(run: Run) -> list[dict]:
 
 
 def flight_layer(run: Run) -> list[dict]:
-    """Pack start and end of each flight [s], and each UAV's positions over the time since then.
+    """Pack start and end of each flight [s], and each UAV's positions over time since its start.
 
-    `run.notes` says where positions are left out.
+    `run.notes` says if tracks or positions are left out.
     """
     tracks = run.tracks
     if tracks is None or tracks.empty:
@@ -262,7 +262,7 @@ def flight_layer(run: Run) -> list[dict]:
 
 
 def bounds_m(run: Run) -> list[float]:
-    """Return x_min, x_max, y_min, y_max of the scene, without one of all devices and links [m]."""
+    """Return x_min, x_max, y_min, y_max [m] of the scene, else of all devices, tracks and links."""
     if run.scene is not None:
         return list(run.scene.config.extent.bounds)
     devices = [device["estimate"] or device["true"] for device in device_layer(run)]
@@ -281,7 +281,7 @@ def bounds_m(run: Run) -> list[float]:
 
 
 def _field(label: str, quantity: str, level_db: np.ndarray, kind: str, unit: str = "dB") -> dict:
-    """Pack levels with their unit and the ends of their colour scale."""
+    """Pack levels with unit and ends of the colour scale, a symmetric one for kind `error`."""
     if kind == "error":
         high = residual_range_db(level_db)
         low = -high
@@ -292,9 +292,9 @@ def _field(label: str, quantity: str, level_db: np.ndarray, kind: str, unit: str
 
 
 def _error_db(radio_map: RadioMap, truth: RadioMap, step: int) -> np.ndarray:
-    """Subtract the truth from a map (device, z, y, x), at every n-th position (`step`).
+    """Return model minus truth [dB] (device, z, y, x), at every `step`-th position in x and y.
 
-    NaN for devices that the truth lacks.
+    `radio_map` has those positions alone. NaN for devices that the truth lacks.
     """
     error_db = np.full(radio_map.gain_db.shape, np.nan)
     model_db, true_db = comparable_db(radio_map, truth), truth.gain_db[..., ::step, ::step]
@@ -306,7 +306,7 @@ def _error_db(radio_map: RadioMap, truth: RadioMap, step: int) -> np.ndarray:
 
 
 def _map_devices(run: Run, name: str) -> int:
-    """Return how many devices of a map the page holds; `run.notes` says if some are left out."""
+    """Return how many devices of a map the page shows; adds to `run.notes` if some are left out."""
     devices, altitudes = run.maps[name].gain_db.shape[:2]
     shown = min(devices, MAX_MAP_DEVICES, max(MAX_VALUES // (3 * altitudes), 1))
     if shown < devices:
@@ -321,7 +321,10 @@ def _same_lattice(one: RadioMap, other: RadioMap) -> bool:
 
 
 def _thinning(run: Run) -> int:
-    """Return n so that every n-th position of all maps fits into `MAX_VALUES`; adds a note."""
+    """Return n so that every n-th position in x and y of all maps fits into `MAX_VALUES`.
+
+    If positions are left out, `run.notes` says so.
+    """
     values = sum(3 * radio_map.gain_db.size for radio_map in run.maps.values())
     step = max(int(np.ceil(np.sqrt(values / MAX_VALUES))), 1)
     if step * run.map_step > 1:
@@ -359,10 +362,10 @@ def street_layer(scene: Scene | None) -> dict | None:
 
 def blocks(height_m: np.ndarray, x_m: float, y_m: float,
            cell_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Build roofs over the cells of a grid, and walls where neighbours differ in height.
+    """Build a block city: a flat roof over each high cell, and walls where neighbours are lower.
 
     Args:
-        height_m: (ny, nx) heights, south first [m]; cells up to `FLAT_M` stay open.
+        height_m: (ny, nx) heights, south first [m]; cells up to `FLAT_M` high get no roof.
         x_m: west edge of the grid [m].
         y_m: south edge of the grid [m].
         cell_m: side of a cell [m].
@@ -399,7 +402,7 @@ def _packed(vertices_m: np.ndarray, faces: np.ndarray) -> dict:
 
 
 def viewer_data(run: Run) -> dict[str, Any]:
-    """Collect all that `viewer.js` reads; adds to `run.notes`."""
+    """Collect the data of the page's 3D viewer (`viewer.js`); `run.notes` says what is left out."""
     city, note = city_mesh(run.scene) if run.scene else (None, "")
     if note:
         run.notes.append(note)

@@ -113,7 +113,10 @@ def write_flight_files(routes: Iterable[Route], origin: Origin | None, folder: P
 
 
 def _plan(route: Route, table: pd.DataFrame, origin: Origin) -> dict:
-    """Return a plan of QGroundControl (file format 1, mission 2): takeoff, waypoints, return."""
+    """Return a plan of QGroundControl (file format 1, mission 2): takeoff, waypoints, way home.
+
+    If the last waypoint is not within 1 m of the first, the UAV lands there instead.
+    """
     first = table.iloc[0]
     items: list[dict] = []
 
@@ -154,7 +157,7 @@ def _coordinates(table: pd.DataFrame) -> list[list[float]]:
 
 
 def _geojson(tables: list[pd.DataFrame]) -> dict:
-    """Return a line for each UAV, and its waypoints (RFC 7946)."""
+    """Return GeoJSON (RFC 7946) with a line for each UAV, and its waypoints as points."""
     features = []
     for table in tables:
         uav, coordinates = table["uav"].iloc[0], _coordinates(table)
@@ -171,7 +174,7 @@ def _geojson(tables: list[pd.DataFrame]) -> dict:
 
 
 def _kml(tables: list[pd.DataFrame]) -> str:
-    """Return a line for each UAV (OGC KML 2.2)."""
+    """Return a KML document (OGC KML 2.2) with a line for each UAV."""
     ET.register_namespace("", KML)
     root = ET.Element(f"{{{KML}}}kml")
     document = ET.SubElement(root, f"{{{KML}}}Document")

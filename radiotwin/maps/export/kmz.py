@@ -139,7 +139,7 @@ def _store(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
 
 
 def _add(parent: ET.Element, tag: str, space: str = KML, **texts: str) -> ET.Element:
-    """Add an element with a child element for each text; return it."""
+    """Add an XML element with a child `<name>text</name>` for each of `texts`; return it."""
     element = ET.SubElement(parent, f"{{{space}}}{tag}")
     for name, text in texts.items():
         ET.SubElement(element, f"{{{KML}}}{name}").text = text
@@ -147,7 +147,7 @@ def _add(parent: ET.Element, tag: str, space: str = KML, **texts: str) -> ET.Ele
 
 
 def _corners(bounds_m: tuple[float, float, float, float], origin: Origin) -> str:
-    """Return longitude and latitude of the outer corners: counter-clockwise, south-west first."""
+    """Return the corners of a rectangle [m] as KML text: counter-clockwise, south-west first."""
     west, east, south, north = bounds_m
     longitude, latitude = to_geographic(origin, [west, east, east, west],
                                         [south, south, north, north])
@@ -167,7 +167,7 @@ def enlarged_png(pixels: np.ndarray) -> bytes:
 
 
 def _legend(norm: Normalize) -> bytes:
-    """Return the PNG of the colour bar."""
+    """Return a PNG of the colour bar of gains [dB]."""
     figure = Figure(figsize=(1.15, 3.6), facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
     figure.colorbar(ScalarMappable(norm, COLOURS), cax=figure.add_subplot(),

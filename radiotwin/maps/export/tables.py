@@ -83,7 +83,7 @@ def write_numpy(radio_map: RadioMap, scene: Scene, path: Path) -> None:
 
 
 def check_map_place(name: str, attributes: dict[str, Any], scene: Scene) -> None:
-    """Check that a map is of a scene's place; else it would get the scene's outlines and origin.
+    """Check that a radio map lies where a scene does, whose origin and outlines it will be given.
 
     Warns:
         The map was made for another version of the scene.
@@ -106,7 +106,7 @@ def check_map_place(name: str, attributes: dict[str, Any], scene: Scene) -> None
 
 def write_ns3(devices: pd.DataFrame, points_m: np.ndarray, gain_db: np.ndarray,
               folder: Path | str) -> int:
-    """Write `nodes.csv` and `losses.csv`.
+    """Write nodes and the path losses between them for ns-3: `nodes.csv` and `losses.csv`.
 
     `nodes.csv` has a row for each node: `node` (its number, devices first), `x_m, y_m, z_m`, and
     `name` (`point0`, … of points). `losses.csv` has a row for each pair with a gain: `device_node`,
