@@ -21,7 +21,7 @@ CRASHES = tuple(getattr(signal, name) for name in ("SIGSEGV", "SIGABRT", "SIGBUS
 
 
 def main() -> None:
-    """Run the command line and end the process; see `exit_status`."""
+    """Run the command line, and end the process with the command's exit status."""
     signals.handle()  # before anything that takes time
     if sys.argv[1:2] and sys.argv[1] in GUARDED:
         _guard()

@@ -299,7 +299,7 @@ class RadioMap(LatticeData):
             gain_db: channel gain [dB], (n, z, y, x) or (n, z * y * x); NaN where not detected.
             los: line of sight by the 3D map, of the same shape.
             sigma_db: standard deviation of the gain [dB], of the same shape.
-            attributes: provenance.
+            attributes: provenance, such as source, frequency and seed.
         """
         shape = (len(devices), *lattice.shape)
         variables = {"gain_db": gain_db.astype(np.float32), "los": los.astype(bool)}

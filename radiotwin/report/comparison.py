@@ -86,7 +86,7 @@ class ComparisonRecord(Record):
     @field_validator("scores")
     @classmethod
     def _complete(cls, scores: list[ScoreRecord]) -> list[ScoreRecord]:
-        """Refuse scores unless each model has one row for every class of links."""
+        """Refuse scores unless each model has one row for all links, one for LoS, one for NLoS."""
         classes = Counter((each.model, each.against, each.positions) for each in scores)
         rows = {(each.model, each.against, each.positions, each.links) for each in scores}
         if len(rows) < len(scores) or any(count != len(CLASSES) for count in classes.values()):

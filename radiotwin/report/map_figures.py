@@ -212,7 +212,7 @@ def _mark_device(ax: Axes, position_m: np.ndarray | None, size: float) -> None:
 
 
 def _mark_twin_device(ax: Axes, device: TwinDevice) -> None:
-    """Mark a twin's device: an anchor, or an estimate with its 90 % circle."""
+    """Mark a twin's device: an anchor, or an estimate with the circle that holds it with 90 %."""
     position_m = np.array([device.x_m, device.y_m])
     if device.role == "anchor":
         _mark_device(ax, position_m, 8)

@@ -156,7 +156,7 @@ def path_layer(scene: Scene, links: pd.DataFrame) -> dict:
 
     Returns:
         `points` (m, 3) of all paths, one path after another, from the device to the receiver [m];
-        `end` (p,) row behind the last point of each path; `link` (p,) row of its link.
+        `end` (p,) row after the last point of each path; `link` (p,) row of its link in `links`.
     """
     def position_m(rows: pd.DataFrame, end: str) -> np.ndarray:
         return rows[[f"{end}_{axis}_m" for axis in "xyz"]].to_numpy(dtype=float)
