@@ -245,7 +245,7 @@ def with_cf(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def without_cf(dataset: xr.Dataset) -> xr.Dataset:
-    """Return the map without the CF attributes that only its file needs."""
+    """Return the map without the CF attributes that only files need; `dataset` loses some, too."""
     dataset = dataset.drop_vars(GRID_MAPPING, errors="ignore")
     dataset.attrs.pop("Conventions", None)
     for name in dataset.variables:

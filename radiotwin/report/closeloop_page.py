@@ -25,7 +25,7 @@ from radiotwin.report.labels import (
     variable_label,
 )
 
-MARKED = " Purple: what was found."  # said where it is drawn, as the next two
+MARKED = " Purple: what was found."  # in captions of figures that show it; so the next two
 FRAMED = " Framed: groups that stand out; dashed: part of their links."
 CONTRIBUTION = " Dashed: contribution of the effects to the prediction."
 MAP = ("residual_map.png", "Residual on the map",
@@ -125,7 +125,7 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
 
 
 def _only_drawn(caption: str, is_drawn: dict[str, bool]) -> str:
-    """Leave sentences about what is not drawn out of a figure's caption."""
+    """Return a caption without the sentences whose value in `is_drawn` is false."""
     for sentence in (each for each, is_there in is_drawn.items() if not is_there):
         caption = caption.replace(sentence, "")
     return caption

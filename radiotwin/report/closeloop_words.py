@@ -224,10 +224,10 @@ def has_additions(report: dict) -> bool:
 
 
 def errors_in_turn(scores: dict, report: dict) -> list[tuple[str, dict]]:
-    """Return label and scores of the rows of an error table: one if nothing was added to the base.
+    """Return label and scores of each error table row; a single row if the base got no addition.
 
     Args:
-        scores: of some links, `before`, `after` and others of `WHEN`.
+        scores: scores of the same links by a key of `WHEN`: `before`, `after` the effects, ….
         report: content of `closeloop.json`.
     """
     labels = WHEN if has_additions(report) else {"before": "before and after"}
@@ -293,7 +293,7 @@ def _effect_words(report: dict) -> str:
     if number(before) == number(after):
         goes = f"stays at {number(after)} dB"
     of = ""
-    if "after_same_links" in error:  # what is told is of the base's links, unless interpolated
+    if "after_same_links" in error:  # the RMSE is of the base's links, unless interpolated
         of = (f" (the last of all {error['after']['n']:,} links)" if explained and interpolated
               else f" (the same {error['before']['n']:,} links)")
     text = (f"{start}: {'; '.join(objects(report))}{sure}. With {it} the RMSE on held-out links "

@@ -70,7 +70,7 @@ def name_label(name: str) -> str:
 
 
 def apart(kind: str, name: str) -> str:
-    """Return a name to write after its kind: `'receiver'` in quotes for a receiver of that name."""
+    """Put a name in quotes if it is the word for its kind: a device "device" becomes `'device'`."""
     return f"'{name}'" if name.lower() == kind else name
 
 
