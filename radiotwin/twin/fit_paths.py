@@ -209,7 +209,7 @@ def _moved(links: Links, shift_m: Shift) -> Links:
 
 
 def _with_copies(links: Links) -> Links:
-    """Append copies of some anchors' links, as unknown devices, to test the localisation."""
+    """Append copies of some anchors' links, as of unknown devices, to test the localisation."""
     count = len(links.device_names)
     unknown = count - len(links.anchors)
     anchors = sorted(links.anchors)[:max(min(MAX_COPIES, MAX_DEVICES - unknown), 0)]

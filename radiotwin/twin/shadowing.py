@@ -121,7 +121,8 @@ def _mean_variance(receiver_m: np.ndarray, precision: np.ndarray, field: Residua
 def with_shadowing(radio_map: RadioMap, twin: Twin) -> RadioMap:
     """Add the correlated share and correlation length of errors to the attributes of a map.
 
-    They are `shadowing_share` and `shadowing_length_m` [m]; the share is 0 below one cell.
+    They are `shadowing_share` and `shadowing_length_m` [m]; the share is 0 if it is below
+    MIN_SHARE, or the length below one cell.
 
     Args:
         radio_map: `twin.radio_map(scene)`.

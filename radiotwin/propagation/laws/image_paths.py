@@ -110,7 +110,7 @@ class LinkFit:
 
         Returns:
             (n,) negative log-likelihood of each link [nats], and (n,) residuals over their scale, 0
-            for links that were not detected.
+            for links that were not detected. Both are 0 in a class without a detected link.
         """
         nll, z = np.zeros((2, len(self.level_db)))
         square_db = np.zeros(len(los)) if square_db is None else square_db

@@ -231,9 +231,9 @@ def _from_edge(planes: np.ndarray, uv_m: np.ndarray, edges: np.ndarray, edge: in
                ) -> tuple[bool, float, float, float]:
     """Find the points of a path from its diffraction at an edge to the receiver x, y, z [m].
 
-    Writes the diffraction point and the reflection points after it into `points_m[first:]`.
-    `along_m` and `across_m` are the position of the device's image along the edge and its distance
-    from it.
+    Writes the diffraction point and the reflection points after it into `points_m[first:]`, and
+    overwrites `mirror`. `along_m` and `across_m` are the position of the device's image along the
+    edge and its distance from it.
 
     Returns:
         False if there is no such path, and the point on the edge [m].

@@ -83,7 +83,7 @@ class Relatives:
     @classmethod
     def fit(cls, links: Links, z: np.ndarray, field: ResidualField | None,
             seed: int) -> Relatives | None:
-        """Fit how residuals follow those of relatives (on one mast); None: no device has relatives.
+        """Fit how residuals follow those of relatives (devices on one mast); None: too few links.
 
         Args:
             links: n links with moving receivers.
