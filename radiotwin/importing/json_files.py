@@ -213,7 +213,10 @@ def _has_lines(file: LogFile) -> bool:
 
 def _add_lines(file: LogFile, table: _Table,
                bad_rows: BadRows | None) -> list[tuple[str, int, str]]:
-    """Add the records of JSON lines to a table; return reason, number and first of bad lines."""
+    """Add the records of JSON lines to a table; return reason, number and first of bad lines.
+
+    Bad are lines that are no JSON object, as far as `bad_rows` allows; else BadInput.
+    """
     bad: list[int] = []
     cut: list[tuple[str, int, str]] = []
     with file.open() as content, io.TextIOWrapper(content, "utf-8", newline="") as text:

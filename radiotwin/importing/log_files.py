@@ -130,7 +130,7 @@ def flight_names(files: list[LogFile]) -> list[str]:
 
 @contextmanager
 def open_archive(path: Path) -> Iterator[zipfile.ZipFile]:
-    """Open a zip file after a check of its size when unpacked.
+    """Open a zip file for reading, after checks of its size when unpacked and its members.
 
     Raises:
         BadInput: no zip file, encrypted, of an unusual compression, or too large.

@@ -333,7 +333,7 @@ def read_levels(source: Source, spec: str, settings: Settings,
 def _refuse_uncalibrated(source: Source, spec: str, db: np.ndarray, high_db: float) -> None:
     """Raise BadInput if many levels (n,) [dB] are `high_db` or more, as of no calibrated receiver.
 
-    Few values with a gap to the others are no fault, but a code for "no reading".
+    One or two different values with a gap to the others pass: they are a code for "no reading".
     """
     over = np.unique(db[db >= high_db])
     share = float(np.mean(db >= high_db)) if len(db) else 0.0

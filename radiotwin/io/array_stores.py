@@ -58,7 +58,7 @@ _ZARR_ADVICE = ("write it again with radiotwin, or with xarray's to_zarr(…, za
 
 
 def check_hdf5(file: IO[bytes], path: Path) -> None:
-    """Check that reading the root group of an HDF5 file is safe.
+    """Check that reading an HDF5 file's root group can neither harm nor fill memory.
 
     Args:
         file: open for reading; its position changes.
@@ -188,7 +188,7 @@ class _Array:
 
 
 def check_zarr(folder: Path, known: Collection[str], streamed: Budget) -> dict[str, int]:
-    """Check that opening a Zarr folder and reading it piece by piece is safe.
+    """Check that opening a Zarr folder and reading its arrays can neither harm nor fill memory.
 
     Args:
         folder: to check.

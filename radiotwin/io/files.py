@@ -60,7 +60,7 @@ def require_suffix(path: Path | str, *allowed: str) -> None:
 
 @contextmanager
 def atomic_path(path: Path | str, flush: bool = True) -> Iterator[Path]:
-    """Write a file atomically with code that takes a path and raises OSError if a write fails.
+    """Write a file as a whole or not at all, with code that takes a path and raises OSError.
 
     Args:
         path: of the file; missing folders are made.
@@ -89,7 +89,7 @@ def atomic_path(path: Path | str, flush: bool = True) -> Iterator[Path]:
 
 @contextmanager
 def atomic_file(path: Path | str, hide_errors: bool = False) -> Iterator[IO[bytes]]:
-    """Write a file atomically with code that takes an open file.
+    """Write a file as a whole or not at all, with code that takes an open file.
 
     Args:
         path: of the file; missing folders are made.
@@ -118,7 +118,7 @@ def atomic_file(path: Path | str, hide_errors: bool = False) -> Iterator[IO[byte
 
 @contextmanager
 def atomic_folder(path: Path | str, names: Collection[str] | None = None) -> Iterator[Path]:
-    """Write a folder atomically.
+    """Write a folder as a whole, or not at all if the block fails.
 
     Args:
         path: of the folder; missing parents are made.

@@ -86,7 +86,6 @@ def as_measurements(given: Measurements | pd.DataFrame | Path | str,
     `in_scene_frame`. A `Measurements` object is not checked: it is converted if both origins are
     known, else returned as it is. Without a scene positions stay as they are.
 
-
     Raises:
         BadInput: `given` is none of these, cannot be read, or does not fit the scene.
     """

@@ -243,7 +243,6 @@ def move_anchors_out(links: Links, scene: Scene, refuse: bool = True) -> Links:
     An anchor is moved only by as much as a map may be wrong, see `radiotwin.scene.footing`; a note
     says which ones were moved. Without `refuse`, one that is too deep inside stays there.
 
-
     Raises:
         BadInput: an anchor is far from the receivers, or too deep inside a building.
     """

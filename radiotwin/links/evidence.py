@@ -57,9 +57,9 @@ def _evidence(links: Links) -> np.ndarray:
 def with_evidence(links: Links, z: np.ndarray) -> Links:
     """Group links whose errors are alike into pieces of evidence, which scores count as one.
 
-    A piece is a square of ground as wide as the distance over which the residuals `z` (n,) of the
-    base model (without effects), divided by their scale, are correlated. A note is added if there
-    are fewer than `FEW_SQUARES` squares.
+    A piece holds the links of a device, receiver and flight on a square of ground as wide as the
+    distance over which the residuals `z` (n,) of the base model (without effects), divided by their
+    scale, are correlated. A note is added if there are fewer than `FEW_SQUARES` squares.
     """
     length_m = correlation_length_m(links, z)
     width_m = evidence_width_m(links, length_m)

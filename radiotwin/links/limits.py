@@ -187,7 +187,7 @@ def _limit_nats(tried_db: np.ndarray, read_db: np.ndarray, mean_db: np.ndarray,
     Given are the readings, ascending, and for the blanks (not detected) the predicted level
     `mean_db` and its error `scale_db` (m,), all in dB. A blank is below the limit, or lost at any
     level; the lost share and the width of the transition are averaged over. `as_one` links count as
-    one.
+    one observation.
     """
     readings, blanks = len(read_db), len(mean_db)
     mean_db = np.round(mean_db / BIN_DB) * BIN_DB
@@ -408,7 +408,7 @@ def limits_to_explain(links: Links) -> Links:
 
     Blanks (not detected) that are predicted above this limit then need another explanation. Such a
     receiver is clearly less sensitive than most, or has blanks at any level. If no limit is known,
-    the lowest reading is that of all receivers.
+    the lowest reading is taken for the limit of all.
     """
     usual_db = links.usual_limit_db
     if usual_db is None:

@@ -232,7 +232,6 @@ class Measurements(Summarised):
 
         The path ends in `.csv`, `.csv.gz` or `.parquet`. A known origin goes to `frame.toml` there.
 
-
         Raises:
             BadInput: `path` cannot be written, or the folder has a `devices.csv` of other devices,
                 or a `frame.toml` of another frame.

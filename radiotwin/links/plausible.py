@@ -53,7 +53,7 @@ _RANGES: dict[str, tuple[float, float, str]] = {
 
 def refuse_implausible(refuse: Callable[[np.ndarray, str], None], name: str,
                   numbers: np.ndarray) -> None:
-    """Refuse values outside the plausible range of their column, as of a wrong unit.
+    """Refuse values outside the plausible range of their column, which may be in a wrong unit.
 
     Args:
         refuse: called with a mask (n,) of bad values and the reason; raises if any is true.

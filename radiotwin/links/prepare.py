@@ -148,7 +148,7 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
 
 def _clearance_m(declared_z_m: np.ndarray, device_m: np.ndarray, receiver_m: np.ndarray,
                  scene: Scene | None) -> np.ndarray:
-    """Return the heights (k,) [m] of devices above the ground, to find altitudes given as heights.
+    """Return the heights (k,) [m] of devices above the ground.
 
     Without a map, they are above the lowest receiver or z = 0, whichever is higher. NaN if a
     device's height is not declared.

@@ -391,7 +391,7 @@ def _unused_note(path: Path | str, unused: Mapping[str, str]) -> list[str]:
 
 
 def _redundant_position(given: Collection[str], crs: bool, prefers_globe: bool) -> tuple[str, ...]:
-    """Return which of latitude, longitude and x, y to ignore: `crs` prefers x and y."""
+    """Return the pair to ignore: latitude, longitude if `crs`, x, y if `prefers_globe`, or none."""
     if not {"latitude", "x"} <= set(given) or not (crs or prefers_globe):
         return ()
     pair = ("latitude", "longitude") if crs else ("x", "y")

@@ -62,7 +62,8 @@ def _machine_bytes() -> int | None:
 def _group_bytes() -> int | None:
     """Return the free memory [bytes] of a container's control group (version 2, else 1), or None.
 
-    File pages that were not used lately are counted as used there, but can be freed.
+    The group's usage includes file pages that were not used lately; they count as free here, as
+    they can be dropped.
     """
     for limit, used, of, files in (
             ("memory.max", "memory.current", "memory.stat", "inactive_file"),

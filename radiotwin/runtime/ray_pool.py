@@ -148,7 +148,7 @@ class RayPool(Pool):
     def _capacity(self, resources: Resources) -> int:
         """Return how many workers to start: as many as asked for, else as fit on the cluster.
 
-        RunFailed if they do not fit.
+        RunFailed if the number that is asked for, or a single one, does not fit.
         """
         nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
         needs = {"CPU": resources.cores, "memory": resources.memory_bytes,

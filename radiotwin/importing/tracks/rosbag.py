@@ -286,7 +286,6 @@ def read_rosbag(path: Path, topic: str | None = None) -> Fixes:
     Times are those of the messages' headers, else of the recording. Messages without a fix are left
     out. `topic` None: the only topic with positions.
 
-
     Raises:
         BadInput: rosbags is not installed, the bag is damaged, or the topic is missing.
     """

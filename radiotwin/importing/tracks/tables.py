@@ -153,7 +153,8 @@ def _time_format(source: Source, spec: str) -> str:
 def _with_milliseconds(source: Source, header: list[str], time_s: np.ndarray) -> np.ndarray:
     """Refine times of whole seconds by a column of milliseconds since the start, if there is one.
 
-    The seconds are truncated, so the start is the latest that any row gives.
+    Whole seconds are cut off, so each row gives a start that is up to 1 s early; the latest is
+    taken.
     """
     names = {_split(name): name for name in header}
     spec = next((names[key] for key in names if key[0] == "time"
