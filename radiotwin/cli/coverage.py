@@ -155,7 +155,7 @@ def _gains(source: Path, world: "Scene", model: str | None) -> "Iterator[Twin | 
 
 
 def _print(found: "Coverage") -> None:
-    """Print the assumptions, the shares of each area, and each server's share."""
+    """Print a prediction's assumptions, covered shares of areas, and share of each server."""
     facts = found.summary
     result("coverage", facts)
     above = "above the ground" if facts["above_ground"] else "above the datum"

@@ -117,7 +117,7 @@ def _check_gpu() -> Rows:
 
 
 def _check_packages(diagnosis: Diagnosis) -> Rows:
-    """List the packages that radiotwin declares, with their installed versions."""
+    """List the declared packages with installed versions; add a problem for each missing one."""
     try:
         rows = [("radiotwin", version("radiotwin"))]
         requirements = requires("radiotwin") or []
@@ -157,7 +157,7 @@ def _check_llvm(diagnosis: Diagnosis) -> Rows:
 
 
 def _check_tracing(diagnosis: Diagnosis) -> Rows:
-    """Trace one link in free space and compare it with Friis' equation."""
+    """Trace one free-space link, to compare with Friis' equation; add a problem if it fails."""
     item = "one link of 100 m at 2.4 GHz"
     try:
         gain_db = trace_trial_link("cpu")

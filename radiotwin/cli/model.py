@@ -79,7 +79,7 @@ def fit(
 
 
 def _print_twin(twin: "Twin", title: str) -> None:
-    """Print positions, the fitted law, and held-out errors of the channel models."""
+    """Print a twin's device positions, fitted law, and held-out errors of the channel models."""
     from radiotwin.twin.selection import LOCATED_BY, HeldOut
 
     table, columns = twin.positions, {"device": "left", "role": "left", "x [m]": "right",

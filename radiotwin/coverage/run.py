@@ -250,7 +250,7 @@ def _refuse_extent_off_map(extent_m: Bounds | None, scene: Scene) -> None:
 
 
 def _noise_figure_db(scene: Scene, settings: CoverageSettings) -> float:
-    """Return the receivers' noise figure [dB]: of the settings, or by the scene's noise power."""
+    """Return the receivers' noise figure [dB]: as set, or as the scene's noise power implies."""
     if settings.noise_figure_db is not None:
         return settings.noise_figure_db
     radio = scene.config.radio

@@ -99,7 +99,7 @@ class MapStream:
     make: Callable[[str, Lattice], dict[str, np.ndarray]]
 
     def blocks(self) -> Iterator[MapBlock]:
-        """Compute all blocks in order, with a progress bar."""
+        """Compute all blocks, device by device in C order, and show a progress bar."""
         parts = list(parts_of(self.lattice.shape))
         with progress("mapping", total=len(self.devices) * len(parts)) as advance:
             for row, device in enumerate(self.devices):

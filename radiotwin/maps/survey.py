@@ -182,7 +182,7 @@ def _require_possible(scene: Scene, truth: RadioMap) -> None:
 
 def random_waypoint(grid: FlightGrid, start: Cell, battery: float, rng: np.random.Generator
                     ) -> list[Cell]:
-    """Return the cells of a flight to random cells by shortest ways, and home in time."""
+    """Return the cells of a flight to random cells and home, as far as the battery allows."""
     cells = [start]
     while True:
         left = battery - MOVE_COST * (len(cells) - 1)
@@ -230,7 +230,7 @@ def _lane_ends(shape: tuple[int, ...], battery: float, rng: np.random.Generator)
 
 def random_walk(grid: FlightGrid, start: Cell, battery: float, rng: np.random.Generator
                 ) -> list[Cell]:
-    """Move or hover with equal probability in every slot while the terminal stays in reach."""
+    """Move to a neighbour or hover, all equally probable, while the terminal stays in reach."""
     cells, left = [start], battery
     while True:
         options = [(cell, MOVE_COST) for cell in grid.neighbours(cells[-1])]

@@ -162,7 +162,7 @@ COLUMNS = ("group", "possible causes", "statistic", "against its peers", "90 % i
 
 
 def seen_from(report: dict) -> str:
-    """Say from which level difference on a device, receiver or flight would have been found."""
+    """Say how many dB a device, receiver or flight has to be off to be found; empty if unknown."""
     found = [f"a {each['family']} that is {each['size']:.1f} dB off"
              for each in report.get("seen_from", [])
              if each["family"] in ENDS and each["statistic"] == "level"]
@@ -256,7 +256,7 @@ def _in_brackets(low: float | None, high: float | None, digits: int = 1) -> str:
 
 
 def _ranges(anomaly: dict) -> list[tuple[str, Sequence[float | None]]]:
-    """Return name and limits of each range of an anomaly; those of x and y as one, `place`."""
+    """Return name and limits of each range of an anomaly; x and y are joined to one, `place`."""
     ranges = dict(anomaly.get("ranges") or {})
     found = []
     if "x_m" in ranges and "y_m" in ranges:

@@ -226,7 +226,7 @@ class BinMeans:
 
 
 def bin_index(value: np.ndarray, count: int) -> np.ndarray:
-    """Return the bin (n,) of each finite value, for `count` bins with about as many values each.
+    """Return the bin (n,) of each finite value, in up to `count` bins of about equally many values.
 
     If there are no more than `count` distinct values, each of them is a bin.
     """

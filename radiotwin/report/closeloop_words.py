@@ -121,7 +121,7 @@ def _member(parameter: str) -> str:
 
 
 def is_changed(effect: dict, member: str) -> bool:
-    """Return whether an effect changes a device or receiver; not if its offset may be 0 dB."""
+    """Return whether an effect changes a device or receiver: not if its offset may be 0 dB."""
     offset = effect["parameters"].get(f"offset_db[{member}]")
     return offset is None or not (offset["low"] or 0.0) <= 0.0 <= (offset["high"] or 0.0)
 
@@ -174,7 +174,7 @@ def undetectable(report: dict) -> str:
 
 
 def with_quality(report: dict) -> str:
-    """State the RMSE where each reading's quality is an input, as on no map; empty if none is."""
+    """State the RMSE of predictions that also know each reading's quality; empty if none do."""
     known = report["error"].get("after_with_quality")
     if not known:
         return ""
@@ -246,7 +246,7 @@ def _largest_first(report: dict) -> list[dict]:
 
 
 def _is_significant(difference_db: dict) -> bool:
-    """Return whether receivers differ by `MIN_DIFFERENCE_DB` or more, in an interval without 0."""
+    """Return whether receivers differ by at least `MIN_DIFFERENCE_DB`, and the interval lacks 0."""
     surely = not difference_db["low"] <= 0 <= difference_db["high"]
     return surely and abs(difference_db["value"]) >= MIN_DIFFERENCE_DB
 
@@ -425,7 +425,7 @@ def _likely(probabilities: list[dict], report: dict) -> str:
 
 
 def _probability_in_brackets(report: dict, name: str) -> str:
-    """Return the probability of a hypothesis in the first step, in brackets; else empty."""
+    """Return a hypothesis' probability at the first step of the search, in brackets; else empty."""
     step = next(iter(report["posterior"]), None)
     found = {each["name"]: each["probability"] for each in step["probabilities"]} if step else {}
     return f" (probability {probability(found[name])})" if name in found else ""

@@ -16,7 +16,7 @@ from radiotwin.report.closeloop_data import DrawnLinks, LoopData
 from radiotwin.report.labels import FITTED, new_figure, signed
 
 MAX_MEMBERS = 40  # of an end; more would be too small to be read
-MIN_LINKS = 3  # of a cell
+MIN_LINKS = 3  # in a cell that is shown
 MAX_NUMBERS = 12  # columns up to which each cell has its number
 SCATTER_COLOURS = "YlGnBu"
 
@@ -116,13 +116,13 @@ def _is_part(anomaly: dict) -> bool:
 
 
 def _framed_members(anomaly: dict) -> dict[str, Sequence[str]]:
-    """Return an anomaly's names by end; if it is about one end (its family), that end's alone."""
+    """Return an anomaly's names by end; if its family is an end, such as device, those alone."""
     members, family = anomaly["members"], anomaly["family"]
     return {family: members[family]} if family in members else members
 
 
 def _label(ax: Axes, found: Pivot, column: int) -> None:
-    """Label the rows and columns of a heat map, and count the members that are not shown."""
+    """Label the rows and columns of a heat map, and say how many names are not shown."""
     rows, columns = found.names
     crowded = len(columns) * max(map(len, columns)) > 40
     ax.set_xticks(range(len(columns)), [_cut(name, 14) for name in columns],

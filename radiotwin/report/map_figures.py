@@ -52,7 +52,7 @@ HeightGrid = tuple[np.ndarray, tuple[float, float, float, float]]
 """(ny, nx) heights [m], and x_min, x_max, y_min, y_max [m]."""
 CELLS = 45  # along the longer side of the map
 MIN_CELL_M = 10.0
-MIN_LINKS = 3  # of a cell
+MIN_LINKS = 3  # in a cell that is drawn
 MAX_MARKS = 80  # more devices or receivers would hide the map
 MAX_NAMES = 30  # beside the marks
 PANEL_IN = 4.9  # width of a panel

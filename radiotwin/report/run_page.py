@@ -104,7 +104,7 @@ def _channel_words(run: Run) -> str:
 
 
 def _law_table(run: Run) -> Table | None:
-    """Return the table of the twin's fitted channel law; None if none, or for a close-loop."""
+    """Return a table of the twin's fitted channel law; None without one, or for a close-loop."""
     if run.twin is None or run.closeloop or not run.twin.provenance.get(LAW):
         return None
     law = run.twin.params
