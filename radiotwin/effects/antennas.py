@@ -46,7 +46,7 @@ AROUND_DEG = np.arange(0.0, 360.0, 5.0)  # azimuths over which a pattern is aver
 
 
 def vary_patterns(effect: Effect, end: str) -> Variation:
-    """Build the search space of an effect with one pattern per device or receiver.
+    """Put the pattern parameters of all devices, or receivers, into one vector for the search.
 
     Args:
         effect: the effect with its patterns.
@@ -72,14 +72,14 @@ def vary_patterns(effect: Effect, end: str) -> Variation:
 def report_patterns(patterns: Mapping[int, EffectParams], params_sd: np.ndarray,
                     names: Sequence[str], prefix: str = "",
                     with_scattered: bool = True) -> dict[str, Parameter]:
-    """Return the reported parameters of fitted patterns by name.
+    """Report every parameter of fitted antenna patterns by name, with a 90 % interval.
 
     Args:
         patterns: k fitted patterns by index of their device or receiver.
         params_sd: (k r,) standard deviations of their r parameters each.
         names: names of the devices or receivers.
         prefix: prefix of the parameters' names.
-        with_scattered: False drops the last parameter, the power on paths that are not followed.
+        with_scattered: False leaves out the last parameter, the power on paths not followed.
     """
     reported = {}
     for (member, pattern), sd in zip(patterns.items(), np.reshape(params_sd, (len(patterns), -1)),
@@ -101,6 +101,7 @@ class BodyFrameEffect(GainEffect):
 
     @override
     def unavailable(self, links: Links) -> str | None:
+        """Return why headings cannot tell body-fixed from world directions; None if they can."""
         if np.isnan(links.heading_deg).all():
             return "there is no heading_deg, so directions in the receiver's body frame are unknown"
         heading = np.radians(links.heading_deg)
@@ -172,14 +173,14 @@ class Departures(NamedTuple):
 
     @classmethod
     def of(cls, links: Links, rows: np.ndarray, straight: bool) -> "Departures":
-        """Find the departures of some links: of paths over the map, or of the straight lines."""
+        """Find at which angles paths over the map (`straight`: direct lines) leave the device."""
         rays = Rays.of(links.select(rows), of_device=True, straight=straight)
         east, north, up = rays.direction.T
         return cls(rays, np.degrees(np.arctan2(east, north)),
                    np.degrees(np.arcsin(np.clip(up, -1, 1))))
 
     def offset_db(self, pattern: SectorPattern) -> np.ndarray:
-        """Compute the gain (n,) of a pattern over the rays of each link [dB]."""
+        """Compute each link's gain (n,) by a pattern instead of an isotropic antenna [dB]."""
         gain = linear(sector_pattern_db(self.azimuth_deg, self.elevation_deg, pattern))
         at_tilt = np.full(len(AROUND_DEG), pattern.tilt_deg)
         mean_gain = np.mean(linear(sector_pattern_db(AROUND_DEG, at_tilt, pattern)))
@@ -213,6 +214,7 @@ class SectorEffect(GainEffect):
 
     @override
     def term(self, links: Links, level_at: LevelAt) -> Term:
+        """Return the pattern's gain on each device's links [dB], and a fitted level per device."""
         offset_db = np.zeros(len(links))
         for device, pattern in self.params.devices.items():
             rows = np.flatnonzero(links.device == device)

@@ -21,7 +21,7 @@ class LinkCache:
         self._known: WeakKeyDictionary[Links, dict] = WeakKeyDictionary()
 
     def get(self, links: Links, key: Hashable, derive: Callable[[], Any]) -> Any:
-        """Return the value of `derive()`, which is called once for these links and this key."""
+        """Return the value of `derive()`, called only once for these links and this key."""
         known = self._known.setdefault(links, {})
         if key not in known:
             known[key] = derive()
@@ -49,7 +49,7 @@ def city_of(links: Links, effect: str) -> CityMap:
 
 def ends_above(links: Links, place_m: Sequence[float],
                rows: np.ndarray | slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
-    """Return both ends (n, 3) of links, z above the ground at one place [m].
+    """Return both ends (n, 3) of links, with z counted from the ground height at one place [m].
 
     Args:
         links: links; without a 3D map the ground is at z = 0.
@@ -79,7 +79,7 @@ def ends_above_ground(links: Links, rows: np.ndarray | slice = slice(None)
 
 
 def subsample(rows: np.ndarray, maximum: int) -> np.ndarray:
-    """Draw at most `maximum` of the rows (n,) at random with a fixed seed, in order.
+    """Draw at most `maximum` of the rows (n,) at random, and sort them; the seed is fixed.
 
     Every k-th row would be biased: devices, receivers and slots take turns in a file.
     """
@@ -105,7 +105,7 @@ def squares_about_mean(values: np.ndarray, weight: np.ndarray) -> float:
 
 
 def add_power(level_db: np.ndarray, power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Add a power to a level.
+    """Add the powers of a level in dB and of a second signal given as linear power.
 
     Args:
         level_db: (n,) level [dB].
@@ -133,9 +133,10 @@ def curve_knots(value: np.ndarray, count: int, circular: bool) -> list[float]:
 
 
 def curve_basis(value: np.ndarray, knots: np.ndarray, circular: bool) -> np.ndarray:
-    """Build the piecewise linear basis (n, knots) of values (n,).
+    """Build hat functions (n, knots) at values (n,), the basis of a piecewise linear curve.
 
-    Constant beyond the outer knots; 0 if the value is unknown.
+    The curve is constant beyond the outer knots; `circular` values are angles [deg]. The row of a
+    value that is NaN or infinite is 0.
     """
     known = np.isfinite(value)
     filled = np.where(known, value, knots[0])

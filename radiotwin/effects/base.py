@@ -72,7 +72,7 @@ class Term:
         return (self.offset_db != 0) | (self.columns != 0).any(axis=1)
 
     def select(self, rows: np.ndarray) -> Term:
-        """Select the term of some links by a mask or indices."""
+        """Return the term for some links only, given by a mask or indices."""
         inputs, scatter_db, unheard_db = (
             None if values is None else values[rows]
             for values in (self.inputs, self.random_effect_sd_db, self.unheard_sd_db))
@@ -197,7 +197,7 @@ class Effect(ABC):
         return vars(self).get("_entry", self)
 
     def with_params(self, params: EffectParams, levels: Levels | None = None) -> Self:
-        """Return a copy of the effect with parameters; `levels` None: unchanged."""
+        """Copy the effect with new parameters, and `levels` if given; it keeps its `entry`."""
         found = copy(self)
         found.params, found.levels = params, levels or self.levels
         vars(found)["_entry"] = self.entry
@@ -208,7 +208,7 @@ class Effect(ABC):
         return self.with_params(self.params.model_copy(update=update))
 
     def record(self) -> dict[str, Any]:
-        """Return its record for JSON: name, variant, params, and `levels` if not the default."""
+        """Return the effect as a dictionary for JSON; `levels` only if not the default."""
         usual = self.levels == type(self).levels
         return {"name": self.name, "variant": self.variant,
                 "params": self.params.model_dump(mode="json")} | (
@@ -236,13 +236,13 @@ class Effect(ABC):
         return "there is no 3D map" if self.needs_map and links.city is None else None
 
     def kind(self) -> Any:
-        """Return a label of its parameters; a search starts from the best proposal of each."""
+        """Return a label of its kind of parameters; the search starts once from each kind."""
         return None
 
     def propose(self, view: ResidualView) -> list[Any]:
         """Propose parameters from the residuals, best first; empty if nothing fits.
 
-        By default the default parameters.
+        By default one proposal, the default parameters.
         """
         return [self.Params()]
 
@@ -260,9 +260,9 @@ class Effect(ABC):
         """
 
     def variation(self) -> Variation | None:
-        """Return the parameters as numbers for a search; None if they are fixed.
+        """Return the parameters as a vector for a numerical search; None if none is searched.
 
-        By default all parameters made with `quantity`, within their bounds.
+        By default all parameters declared with `quantity`, kept within their bounds.
         """
         fields = quantities(self.Params)
         if not fields:
@@ -282,20 +282,20 @@ class Effect(ABC):
         return not self.of_receiver
 
     def between_flights(self) -> Effect | None:
-        """Return a variant restricted to changes between flights; None: no change in time.
+        """Return the effect restricted to changes between flights; None if it has none in time.
 
-        Held-out flights do not show such a change, so it has a separate search.
+        Such a change is searched separately, as held-out flights cannot show it.
         """
         return None
 
     def change(self, links: Links) -> Change | None:
-        """Return which end changed and when; None: no change in time."""
+        """Return which device or receiver changed, and when; None if nothing changes in time."""
         return None
 
     def reading_offsets_db(self, coefficients: np.ndarray) -> dict[int, float]:
-        """Return receiver index -> offset of its readings [dB]; by default empty.
+        """Return receiver index -> by how much the effect shifts all its readings [dB].
 
-        The limit of detection of a receiver shifts with its readings.
+        The receiver's limit of detection shifts by as much. By default empty: no shift.
 
         Args:
             coefficients: (q,) fitted coefficients of its term.
@@ -323,7 +323,7 @@ class Effect(ABC):
                    for name, each in quantities(self.Params).items() if each["prior_sd"])
 
     def implausible(self, coefficients: np.ndarray) -> str | None:
-        """Return why the fitted values are physically impossible for this effect; None if possible.
+        """Return why the fit makes no physical sense by the effect's own rule; by default None.
 
         Args:
             coefficients: (q,) fitted coefficients of its term.
@@ -335,9 +335,9 @@ class Effect(ABC):
         return None
 
     def same_as(self, links: Links, parameters: Mapping[str, Parameter]) -> list[str]:
-        """Return names of effects that these links cannot distinguish from it.
+        """List the other effects that would explain these links equally well, by name.
 
-        E.g. the offset of a device that only one receiver heard is that of the receiver, too.
+        E.g. an offset of a device that only one receiver heard may as well be that receiver's.
 
         Args:
             links: links of the fit.
@@ -350,7 +350,7 @@ class Effect(ABC):
         return []
 
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
-        """Return the reported parameters by name; by default those made with `quantity`."""
+        """Return name -> fitted value with 90 % interval; by default those made with `quantity`."""
         return {name: Parameter.normal(getattr(self.params, name), sd, field["unit"],
                                        Allowed.of(field))
                 for (name, field), sd in zip(quantities(self.Params).items(), estimate.params_sd,
@@ -365,15 +365,15 @@ class Effect(ABC):
         return Correction()
 
     def typical_patterns(self, view: ResidualView) -> Iterable[Pattern]:
-        """Yield the changes of levels by typical effects of this kind, for a view's links.
+        """Yield the level changes that typical examples of this effect would cause on the links.
 
-        The smallest size that would have been detected follows from each. By default none: then
-        no detectable size is reported.
+        From each follows the smallest size that these data would reveal. By default none: then no
+        detectable size is reported.
         """
         return ()
 
     def like(self, other: Any) -> Effect:
-        """Return this effect with the equivalent parameters closest to another one's.
+        """Return the same effect, in those equivalent parameters that are closest to another's.
 
         Several parameters may mean the same, e.g. a box turned by 90° with its sides exchanged.
         """
@@ -403,14 +403,14 @@ class _ResponseEffect(Effect):
 
     @abstractmethod
     def response(self, level_db: np.ndarray, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Map mean levels before the stage to those behind it.
+        """Map the mean levels that enter this stage of reception to those that leave it.
 
         Args:
-            level_db: (n,) level before [dB].
+            level_db: (n,) level that enters [dB].
             inputs: (n, …) from `inputs`.
 
         Returns:
-            (n,) level behind [dB], and (n,) its derivative with respect to `level_db`, positive.
+            (n,) level that leaves [dB], and (n,) its derivative by `level_db`, positive.
         """
 
     def term(self, links: Links, level_at: LevelAt) -> Term:
@@ -492,10 +492,10 @@ class ResidualView:
     group: np.ndarray | None = None
 
     def of_group(self, group: np.ndarray) -> ResidualView:
-        """Set the residual to 0 on links that the cause of a group (mask (n,)) cannot affect.
+        """Set the residual to 0 on links that the cause of an odd group (mask (n,)) cannot affect.
 
         A cause may act on all links of the device and receiver that the group has in common, or
-        else of its flight; if it has none in common, on all links.
+        else of its only flight; if the group has none of these in common, on all links.
         """
         links = self.links
         ends = [label == label[group][0] for label in (links.device, links.receiver)
@@ -518,7 +518,7 @@ class ResidualView:
 
     @cached_property
     def design_effect(self) -> float:
-        """Number of links that count as one, as errors of nearby links are correlated."""
+        """Number of neighbouring links that count as one, as their errors are correlated."""
         return design_effect(evidence_blocks(self.links), self.residual_db / self.scale_db)
 
     @cached_property
@@ -532,10 +532,10 @@ class ResidualView:
         return (DOF + 1) / (DOF + z * z) / self.scale_db**2 / self.design_effect
 
     def gain_nats(self, rows: np.ndarray, change_db: np.ndarray) -> np.ndarray:
-        """Compute the log-likelihood gain (r,) of links if their mean level changes [nats].
+        """Compute how each link's log-likelihood (r,) grows if its mean level changes [nats].
 
-        By Student's t before and after, as a change makes new outliers that `weight` does not know.
-        A blank fits any level below the limit of detection.
+        By Student's t before and after, as a change makes new outliers that `weight` does not know;
+        divided by the design effect. A blank (not detected) fits any level below the limit.
 
         Args:
             rows: (r,) indices of links.
@@ -546,7 +546,7 @@ class ResidualView:
         # A blank has residual 0 until its mean exceeds the limit, `spare_db` above the prediction.
         spare_db = self.links.limit_db[rows] - self.mean_db[rows]
         spare_db = np.where(np.isfinite(spare_db), spare_db, np.inf)
-        # Probability that it is blank because of its level: the residual was multiplied by it.
+        # Probability that its level made it blank; `residual_db` of a blank contains this factor.
         share = np.where(spare_db < 0, self.residual_db[rows] / np.minimum(spare_db, -1e-9), 1.0)
         rest_db = np.where(blank, share * np.minimum(spare_db - change_db, 0.0),
                            self.residual_db[rows] - change_db)
@@ -555,10 +555,10 @@ class ResidualView:
                                   - np.log1p(after / DOF)) / self.design_effect
 
     def score(self, term: Term) -> float:
-        """Compute the log-likelihood gain of a term, approximately [nats].
+        """Approximate the log-likelihood gain of adding an effect's term to the model [nats].
 
-        Half of the reduction of the weighted sum of squares, with the term's coefficients and one
-        level per class of line of sight fitted.
+        Half of the reduction of the weighted squared residuals. The term's coefficients are fitted,
+        and one level each for links with and without line of sight.
         """
         weight = self.weight
         target = self.residual_db - term.offset_db
@@ -571,7 +571,7 @@ class ResidualView:
 
 def _weighted_squares(columns: np.ndarray, prior_sd: np.ndarray, target: np.ndarray,
                       weight: np.ndarray) -> float:
-    """Compute the weighted residual sum of squares after a ridge regression on columns."""
+    """Compute the weighted squares, plus penalty, that a ridge regression on columns leaves."""
     weighted = columns.T * weight
     precision = 1.0 / np.square(prior_sd) + 1e-9
     moments = weighted @ target

@@ -60,7 +60,7 @@ class Box(NamedTuple):
         return self._replace(turn_deg=(self.turn_deg + turn_deg + 90.0) % 180.0 - 90.0)
 
     def like(self, other: "Box") -> "Box":
-        """Return the same box with the equivalent turn closest to another box's."""
+        """Return the same box, turned by quarters (sides exchanged) to come closest to another."""
         quarters = round((other.turn_deg - self.turn_deg) / 90.0)
         sides = (self.length_m, self.width_m)[::-1 if quarters % 2 else 1]
         return self._replace(length_m=sides[0], width_m=sides[1],
@@ -81,7 +81,7 @@ class Box(NamedTuple):
 
 
 def grid_around(box: Box, margin_m: float, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return x and y (count, count) of grid points over a box's footprint and a margin [m]."""
+    """Lay a grid over a box's footprint plus a margin: x and y (count, count) of its points [m]."""
     turn, share = np.radians(box.turn_deg), (np.arange(count) + 0.5) / count - 0.5
     along_m, across_m = np.meshgrid(share * (box.length_m + 2 * margin_m),
                                      share * (box.width_m + 2 * margin_m))
@@ -120,7 +120,7 @@ class Crossing(NamedTuple):
 
 
 def cross(box: Box, a_m: np.ndarray, b_m: np.ndarray) -> Crossing:
-    """Compute where links cross a box.
+    """Compute where links cross a box; NaN where the link's track on the ground misses it.
 
     Args:
         box: box on the ground.
@@ -137,7 +137,11 @@ def cross(box: Box, a_m: np.ndarray, b_m: np.ndarray) -> Crossing:
 def _crossing(start: np.ndarray, end: np.ndarray, start_z_m: np.ndarray, end_z_m: np.ndarray,
               length_m: np.ndarray, half_length_m: float, half_width_m: float, height_m: float
               ) -> np.ndarray:
-    """Compute the fields of `Crossing` (8, n); start and end (n, 2) in the box's axes [m]."""
+    """Compute where links cross a box: rows (8, n) are the fields of `Crossing`, in order [m].
+
+    The ends, start and end (n, 2), are in axes along the box's sides, from its centre. Where the
+    ground track misses the box, the length inside is 0 and the rest NaN.
+    """
     found = np.full((8, len(start)), np.nan)
     found[0] = 0.0
     for i in range(len(start)):
@@ -169,7 +173,7 @@ def _crossing(start: np.ndarray, end: np.ndarray, start_z_m: np.ndarray, end_z_m
 
 @njit(cache=True, error_model="numpy")
 def _shares_within(start: float, step: float, half: float) -> tuple[float, float]:
-    """Return the fractions of a way at which one coordinate enters and leaves ±half."""
+    """Return from which to which fraction of a step a coordinate is in ±half; inf, -inf: never."""
     if abs(step) < 1e-9:  # at right angles to the axis: within all the way, or never
         return (-np.inf, np.inf) if abs(start) <= half else (np.inf, -np.inf)
     one, other = (-half - start) / step, (half - start) / step
@@ -179,7 +183,7 @@ def _shares_within(start: float, step: float, half: float) -> tuple[float, float
 @njit(cache=True, error_model="numpy")
 def _share_below(start_z_m: float, rise_m: float, enter: float, leave: float,
                  height_m: float) -> float:
-    """Return the fraction of a link, between fractions enter and leave, below a height."""
+    """Return the fraction of a link, within fractions enter to leave, below a height; < 0: none."""
     if abs(rise_m) < 1e-9:
         return leave - enter if start_z_m < height_m else 0.0
     roof = (height_m - start_z_m) / rise_m
@@ -196,8 +200,8 @@ def is_beside_unknown(through: np.ndarray, links: Links) -> bool:
     """Check whether nearly all links through a box belong to devices of estimated position.
 
     Args:
-        through: (k,) links of each device through the box, from `devices_through`.
-        links: all links.
+        through: (k,) number of each device's links through the box.
+        links: all links; their anchors are the devices of known position.
     """
     return bool(through[sorted(links.anchors)].sum() < MIN_SHARE * through.sum())
 
@@ -205,8 +209,8 @@ def is_beside_unknown(through: np.ndarray, links: Links) -> bool:
 def is_seen_from_one_place(through: np.ndarray, links: Links) -> bool:
     """Check whether nearly all links through a box belong to devices at one place.
 
-    Seen from one place, a large box far away hides the same links as a small one nearby. Arguments
-    as in `is_beside_unknown`.
+    Seen from one place, a large box far away hides the same links as a small one nearby. `through`
+    (k,) is the number of each device's links through the box.
     """
     away_m = np.linalg.norm((links.device_m - links.device_m[through.argmax()])[:, :2], axis=1)
     return bool(through[away_m > SAME_PLACE_M].sum() < MIN_SHARE * through.sum())
@@ -239,11 +243,11 @@ def obstruction_nats(residual_db: np.ndarray, scale_db: np.ndarray,
 
 def best_cells(centres_m: np.ndarray, total_nats: np.ndarray,
                count: int) -> list[tuple[np.ndarray, int, float]]:
-    """Pick the cells of highest gain, at least `MIN_APART_M` from each other.
+    """Pick the ground cells with the highest log-likelihood gain, `MIN_APART_M` apart or more.
 
     Args:
         centres_m: (m, 2) centres of the cells [m].
-        total_nats: (m, heights) from `back_project` [nats].
+        total_nats: (m, heights) gain of a box in each cell, by trial height [nats].
         count: largest number of cells.
 
     Returns:
@@ -261,7 +265,7 @@ def best_cells(centres_m: np.ndarray, total_nats: np.ndarray,
 
 def back_project(a_m: np.ndarray, b_m: np.ndarray,
                  nats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sum the links' gains from an obstruction over the ground cells that they pass.
+    """Sum over each ground cell the log-likelihood gains of the links that pass through it.
 
     The sum is greatest where a box would obstruct the links with missing power and no others.
 
@@ -378,7 +382,7 @@ def buildings(city: CityMap) -> tuple[np.ndarray, np.ndarray]:
 
 
 def building_extents_m(city: CityMap, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the least and the greatest x, y and z (buildings, 3) of faces by label (f,) [m]."""
+    """Find the least and greatest x, y, z (buildings, 3) over the faces (f,) of each label [m]."""
     corners_m = city.vertices[city.faces]
     low_m = np.full((label.max() + 1, 3), np.inf)
     high_m = -low_m
@@ -390,7 +394,7 @@ def building_extents_m(city: CityMap, label: np.ndarray) -> tuple[np.ndarray, np
 def building_height_sds_m(city: CityMap) -> np.ndarray:
     """Compute the standard deviation of the mapped height of each building (buildings,) [m].
 
-    The mean over its faces, but at least `HEIGHT_SD_M` (a storey), which is also the default.
+    Mean of the map's values for its faces, at least `HEIGHT_SD_M` (a storey), the default.
     """
     label, centres_m = buildings(city)
     if city.height_sd_m is None:
@@ -398,5 +402,5 @@ def building_height_sds_m(city: CityMap) -> np.ndarray:
     known = np.isfinite(city.height_sd_m)
     faces = np.bincount(label[known], minlength=len(centres_m))
     sums = np.bincount(label[known], weights=city.height_sd_m[known], minlength=len(centres_m))
-    # With a smaller one, small errors of a roof's height would fit other shadows near it.
+    # If it were smaller, small errors of this height would be fitted to other shadows nearby.
     return np.maximum(sums / np.maximum(faces, 1), HEIGHT_SD_M)

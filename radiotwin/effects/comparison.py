@@ -23,10 +23,10 @@ MAX_Z, MIN_SD_DB = 4.0, 0.3  # clip of a value [sd of its class], and least such
 
 @lru_cache(maxsize=VIEWS)
 def compared_db(view: ResidualView) -> np.ndarray:
-    """Subtract from residuals (n,) the median of other flights at the same place [dB].
+    """Subtract from residuals (n,) the median residual of other flights at the same place [dB].
 
     Same place: same device (same receiver, if devices move) within the residual's correlation
-    length. NaN if no other flight was there; read-only, as it is cached.
+    length. NaN if too few links of other flights were there; read-only, as it is cached.
     """
     links, z = view.links, view.residual_db / view.scale_db
     reach_m = min(max(correlation_length_m(links, z), MIN_STEPS * median_step_m(links)),
@@ -40,13 +40,13 @@ def compared_db(view: ResidualView) -> np.ndarray:
         if len(rows) > MIN_OTHERS:
             result[rows] = view.residual_db[rows] - _other_flights_db(
                 end_m[rows], links.flight[rows], view.residual_db[rows], reach_m)
-    result.setflags(write=False)  # kept for the next effect that asks
+    result.setflags(write=False)  # cached, so no caller may change it
     return result
 
 
 def _other_flights_db(position_m: np.ndarray, flight: np.ndarray, residual_db: np.ndarray,
                       reach_m: float) -> np.ndarray:
-    """Compute the median residual (r,) of other flights within reach; NaN if too few are."""
+    """Compute the median residual (r,) of nearby links of other flights; NaN if too few [dB]."""
     count = min(NEIGHBOURS, len(position_m))
     distance_m, near = cKDTree(position_m).query(position_m, count, distance_upper_bound=reach_m)
     distance_m, near = distance_m.reshape(len(position_m), -1), near.reshape(len(position_m), -1)
@@ -61,22 +61,22 @@ def _other_flights_db(position_m: np.ndarray, flight: np.ndarray, residual_db: n
 
 
 def compared_where_possible_db(view: ResidualView) -> tuple[np.ndarray, np.ndarray]:
-    """Return `compared_db` (n,), or the residual itself if NaN; and the mask of the former."""
+    """Return `compared_db` (n,), with the plain residual where that is NaN, and where it is not."""
     rest_db = compared_db(view)
     known = np.isfinite(rest_db)
     return np.where(known, rest_db, view.residual_db), known
 
 
 def by_precision(view: ResidualView, rest_db: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centre and clip residuals in each class of sight, and weight them by inverse variance.
+    """Centre, clip and weight residuals, separately for links with and without line of sight.
 
     Links with line of sight scatter by 1 to 2 dB, others by 10 dB: a common change shows in the
     former, and a median over both would hide it. Values are clipped at `MAX_Z` standard deviations
-    of their class; weights are divided by the design effect.
+    of their class; weights are inverse variances, divided by the design effect.
 
     Args:
         view: n links.
-        rest_db: (n,) compared residuals; NaN = unknown, weight 0.
+        rest_db: (n,) residuals minus those of other flights there; NaN = unknown, weight 0.
 
     Returns:
         (n,) values [dB], and (n,) weights [1/dB²].
@@ -102,17 +102,17 @@ def mean_by_precision(value_db: np.ndarray, weight: np.ndarray) -> float:
 
 def share_alike(label: np.ndarray, value_db: np.ndarray, weight: np.ndarray, minimum: int,
                 least_db: float) -> float:
-    """Compute the share of members whose weighted mean exceeds a threshold, in its direction.
+    """Compute the share of devices (or receivers) whose weighted mean is beyond a threshold.
 
     Args:
         label: (n,) device or receiver.
         value_db: (n,) values [dB].
         weight: (n,) weights.
-        minimum: least number of values of a member.
+        minimum: least number of values of a device or receiver, else it does not count.
         least_db: threshold [dB]; if negative, means below it are counted.
 
     Returns:
-        0 to 1; 0 if no member has enough values.
+        0 to 1; 0 if no device or receiver has enough values.
     """
     means = [mean_by_precision(value_db[label == member], weight[label == member])
              for member, count in zip(*np.unique(label, return_counts=True), strict=True)
@@ -121,7 +121,7 @@ def share_alike(label: np.ndarray, value_db: np.ndarray, weight: np.ndarray, min
 
 
 def flight_mask(links: Links, receiver: int | None, flight: str | None) -> np.ndarray:
-    """Return the mask (n,) of a receiver's links on a flight of that name; None: any."""
+    """Mark the links (n,) of one receiver on all flights of that name; None: of any."""
     mask = np.ones(len(links), dtype=bool)
     if receiver is not None:
         mask &= links.receiver == receiver

@@ -61,7 +61,7 @@ def max_rain_db_km(frequency_hz: float) -> float:
 
 
 def _interpolated(frequency_hz: float, column: int) -> float:
-    """Interpolate a column of `TABLE` in log-log; outside, the nearest row.
+    """Interpolate a column of `TABLE` [dB/km] in log-log; outside, the nearest row.
 
     Below 1 GHz attenuation is lower than at 1 GHz, so the value is still an upper bound.
     """
@@ -70,7 +70,7 @@ def _interpolated(frequency_hz: float, column: int) -> float:
 
 
 def max_loss_db(frequency_hz: float) -> float:
-    """Compute the greatest loss A_m of a link into woodland [dB]; NaN Hz: that at 1 GHz."""
+    """Compute the greatest loss into woodland (A_m, ITU-R P.833) [dB]; NaN frequency: at 1 GHz."""
     if not np.isfinite(frequency_hz):
         return UNKNOWN_MAX_LOSS_DB
     low_hz, high_hz = MEASURED_HZ[0] / MAX_FACTOR, MEASURED_HZ[1] * MAX_FACTOR

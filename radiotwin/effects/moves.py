@@ -20,7 +20,7 @@ MAX_PROPOSE_LINKS = 600  # of an end, drawn at random to test moves
 
 
 class MovedEnd(GainEffect):
-    """A device or receiver at another position than given; each step finds the worst one."""
+    """A device or receiver at another position than given; each search step finds the worst one."""
 
     repeatable = True
     always_exact = True  # paths along streets determine the position
@@ -41,6 +41,7 @@ class MovedEnd(GainEffect):
 
     @override
     def term(self, links: Links, level_at: LevelAt) -> Term:
+        """Return the change of predicted levels if the end is at its new position [dB]."""
         offset_db, rows = np.zeros(len(links)), self.rows(links)
         given = links.select(rows)
         offset_db[rows] = level_at(self.moved(given), self.is_exact) \
@@ -52,11 +53,11 @@ class MovedEnd(GainEffect):
         return self.with_params(self.params, "exact")
 
     def best_move(self, view: ResidualView, ends: Iterable[list[Any]]) -> list[Any]:
-        """Return the parameters of the move with the highest gain; empty if below `MIN_NATS`.
+        """Find the trial move with the highest log-likelihood gain; empty if below `MIN_NATS`.
 
         Args:
             view: residuals.
-            ends: list of trial parameters for each end.
+            ends: for each device or receiver, the parameters of its trial moves.
         """
         links, best, most_nats = view.links, [], MIN_NATS
         for moves in ends:

@@ -17,7 +17,7 @@ NEAR_SHARE = 0.5  # grid of folds over the step of the search, where each value 
 
 
 def _within(end: str) -> AfterValidator:
-    """Make a validator: an index must be below the number of devices or receivers of a twin."""
+    """Make a validator: an index must be below a model's number of devices or receivers (`end`)."""
     def check(index: int, info: ValidationInfo) -> int:
         if info.context and index >= info.context[end]:
             raise ValueError(f"there is no {end} of index {index}")
@@ -87,17 +87,17 @@ class Allowed:
 
     @classmethod
     def of(cls, field: dict[str, Any]) -> "Allowed":
-        """Derive them from a field of `quantities`; an angle of a range over 360° is periodic."""
+        """Take the bounds from a field of `quantities`; an angle ranging over 360° is periodic."""
         low, high = field["low"], field["high"]
         if field["unit"] == "deg" and high - low > CIRCLE_DEG:
             return cls(period=CIRCLE_DEG)
         return cls(low, high)
 
     def span(self, unit: str) -> float:
-        """Compute the width of the prior, of the logarithm if `is_log`.
+        """Compute the width of the allowed range, or of its natural logarithm if `is_log`.
 
         Args:
-            unit: unit of the values; levels without bounds have the span `LEVELS_DB`.
+            unit: unit of the values; dB and dBm span `LEVELS_DB` at most.
         """
         if self.is_log:
             return float(np.log(self.high / self.low)) if 0 < self.low and np.isfinite(self.high) \
@@ -132,7 +132,7 @@ class Parameter:
     @classmethod
     def normal(cls, value: float, sd: float, unit: str, allowed: Allowed = ANY_VALUE
                ) -> "Parameter":
-        """Build a parameter from an estimate and its standard deviation; angles modulo a period."""
+        """Build a parameter from value and sd, with 90 % interval; periodic angles are wrapped."""
         value = value % allowed.period if np.isfinite(allowed.period) else value
         reach = QUANTILE_90 * sd
         return cls(float(value), float(value - reach), float(value + reach), unit, allowed=allowed)
@@ -154,7 +154,7 @@ class Parameter:
         return bool(np.ptp(ends) <= MAX_SHARE * self.allowed.span(self.unit))
 
     def record(self) -> dict[str, Any]:
-        """Return the record of `closeloop.json`.
+        """Return the parameter as a dictionary for `closeloop.json`.
 
         An angle is within one period. Its interval is the arc from `low` up to `high`, which may
         pass 0; it is NaN if the angle is not determined.
@@ -231,7 +231,7 @@ class Variation:
     starts: Sequence[np.ndarray] = ()
 
     def parameters(self, units: Mapping[str, str], params_sd: np.ndarray) -> dict[str, Parameter]:
-        """Return the reported parameters, by name, from units by name and their sds (r,)."""
+        """Return name -> value with 90 % interval, from units by name, in order, and sds (r,)."""
         return {name: Parameter.normal(value, sd, unit, Allowed(low, high))
                 for (name, unit), value, sd, low, high in zip(
                     units.items(), self.values.tolist(), params_sd, self.low.tolist(),

@@ -56,7 +56,7 @@ class Pattern:
 
 
 def members(label: np.ndarray) -> list[np.ndarray]:
-    """Return masks (n,) of up to `MAX_MEMBERS` labels with enough links; empty if only one has."""
+    """Return one mask (n,) per label with enough links, `MAX_MEMBERS` at most; of one label, []."""
     frequent = frequent_labels(label, MIN_LINKS)
     if len(frequent) < 2:
         return []
@@ -64,16 +64,17 @@ def members(label: np.ndarray) -> list[np.ndarray]:
 
 
 def timed_members(links: Links, label: np.ndarray) -> list[np.ndarray]:
-    """Return those masks of `members` with times for most links, not all at one time."""
+    """Return those masks of `members` in which most links have times, and not all the same time."""
     timed = np.isfinite(links.time_s)
     return [mask for mask in members(label)
             if timed[mask].mean() > 0.5 and np.ptp(links.time_s[mask & timed]) != 0]
 
 
 def lengths_in_boxes(links: Links, high_m: float) -> Iterator[np.ndarray]:
-    """Yield the length (n,) of each link with line of sight inside a typical box [m].
+    """Yield, for each of some trial boxes, the length (n,) of every link inside the box [m].
 
-    Boxes are `WIDE_M` wide and stand on such links; up to `MAX_PLACES`, from few to many links.
+    Boxes are `WIDE_M` wide and stand on links with line of sight; other links have 0. At most
+    `MAX_PLACES` boxes, from those that few links pass to those that many pass.
     """
     rows = np.flatnonzero(links.los)
     a_m, b_m = ends_above_ground(links, rows)

@@ -90,7 +90,7 @@ def effects_named(name: str) -> list[type[Effect]]:
 
 
 def effect_named(name: str, variant: str) -> Effect:
-    """Return a new instance of an effect by name and variant, as a twin's file has them.
+    """Make a new instance of an effect by name and variant, as a saved fit (a twin) names them.
 
     Raises:
         BadInput: no effect of that name is installed, or none of that variant.

@@ -77,7 +77,7 @@ class CensoredRegression:
     random_effect_sd_db: np.ndarray | float = 0.0
 
     def arriving(self, coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-        """Compute the mean level before the receiver from coefficients (p0 + p1,).
+        """Compute the mean level that arrives at the receiver, from coefficients (p0 + p1,).
 
         Returns:
             (n,) mean level [dB], and its derivative (n,) with respect to the channel law's level;
@@ -90,7 +90,9 @@ class CensoredRegression:
         return level_db + self.gain_db + self.gain_columns @ coefficients[split:], slope
 
     def linearise(self, coefficients: np.ndarray, scale_db: np.ndarray) -> "Linearisation":
-        """Compute mean and scale of the readings with their derivatives.
+        """Compute mean and error scale of the readings behind the receiver, with their derivatives.
+
+        If the receiver's response is not linear, by quadrature over the arriving level.
 
         Args:
             coefficients: (p0 + p1,).
@@ -110,7 +112,7 @@ class CensoredRegression:
             cross += weight * change * (node_slope - 1)
         variance = np.maximum(square - mean**2, 0.0)
         instrument = (INSTRUMENT_SHARE * scale_db[self.group]) ** 2
-        share = 1 - instrument / scale**2  # a linear response keeps the scale
+        share = 1 - instrument / scale**2  # so that a linear response keeps the scale
         total = instrument + share * variance
         growth = share * (cross - mean * (slope - 1)) / total
         return Linearisation(arriving_db + mean, np.sqrt(total), law_slope, slope, growth,

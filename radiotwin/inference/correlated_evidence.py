@@ -68,14 +68,14 @@ class CorrelatedEvidence:
     @classmethod
     def fit(cls, series: np.ndarray, position_m: np.ndarray, z: np.ndarray, nuisance: Columns,
             seed: int) -> Self:
-        """Choose the correlation length of highest marginal likelihood.
+        """Build the evidence for the correlation length with the highest marginal likelihood.
 
         Args:
             series: (n,) label of the field that each row belongs to.
             position_m: (n, 3) positions [m].
             z: (n,) standardised residuals; NaN: not used.
             nuisance: columns fitted in every likelihood.
-            seed: of the random draw, if there are more than `MAX_ROWS` rows.
+            seed: of the random choice of rows, if there are more than `MAX_ROWS`.
         """
         rng = np.random.default_rng(seed)
         chosen = []
@@ -129,11 +129,11 @@ class CorrelatedEvidence:
 
     def of_rotated(self, z: np.ndarray, columns: np.ndarray, prior_sd: np.ndarray,
                    start: np.ndarray = START) -> tuple[float, np.ndarray]:
-        """Maximise the log marginal likelihood of rotated residuals over both variances.
+        """Fit noise and field variance by marginal likelihood, in the eigenbasis of the field.
 
         Args:
-            z: (m,) rotated residuals.
-            columns: (m, q) rotated columns.
+            z: (m,) residuals, transformed by `rotated`.
+            columns: (m, q) columns, transformed alike.
             prior_sd: (q,) prior standard deviations of their coefficients.
             start: (2,) initial logarithms of the variances, see `START`.
 
@@ -157,13 +157,15 @@ class CorrelatedEvidence:
 
     def at(self, z: np.ndarray, columns: np.ndarray, prior_sd: np.ndarray,
            theta: np.ndarray) -> tuple[float, np.ndarray]:
-        """Compute the log marginal likelihood of rotated residuals for log variances theta (2,).
+        """Compute the log marginal likelihood of rotated residuals for given log variances.
+
+        `theta` (2,): log noise variance, and log of field over noise variance.
 
         Returns:
             log marginal likelihood [nats], and its gradient (2,) in theta.
         """
         variance = np.exp(theta[0]) * (1.0 + np.exp(theta[1]) * self.spectrum)
-        share = 1.0 - np.exp(theta[0]) / variance  # of the field
+        share = 1.0 - np.exp(theta[0]) / variance  # of the variance that is the field's
         value, left, freedom = np.log(variance).sum() + (z * z / variance).sum(), z, np.zeros(2)
         if columns.shape[1]:
             # A matrix times its own transpose takes half of the time of another product
@@ -186,10 +188,10 @@ class CorrelatedEvidence:
 
     def information(self, pattern: np.ndarray, columns: np.ndarray, prior_sd: np.ndarray,
                     theta: np.ndarray) -> float:
-        """Compute the Fisher information about the size of a rotated pattern (m,) [1/size²].
+        """Compute the Fisher information about the size of a level pattern (m,) [1/size²].
 
-        Twice the expected log-likelihood ratio of the pattern at size 1, with the columns fitted as
-        well. Other arguments as in `at`.
+        Twice the expected log-likelihood ratio of size 1 to 0, with the columns fitted as well. All
+        are transformed by `rotated`; other arguments as in `at`.
         """
         variance = np.exp(theta[0]) * (1.0 + np.exp(theta[1]) * self.spectrum)
         weighted = columns.T / variance

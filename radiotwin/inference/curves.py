@@ -48,7 +48,7 @@ class Curves:
     bins: Mapping[str, Statistic]
 
     def log_odds(self, usual_sd: float, prior_odds: float) -> np.ndarray:
-        """Compute the log odds (p,) that a curve varies more than its peers; NaN = not judged.
+        """Compute the log odds (p,) that a curve's bins vary more than its peers'; NaN: not judged.
 
         Args:
             usual_sd: median standard deviation of the bins of a curve that stands out.
@@ -84,10 +84,10 @@ class Curves:
 
 
 def compare_curves(found: Statistic, curve: np.ndarray, prior_sd: float, part: str) -> Curves:
-    """Estimate how much each curve varies, and its likelihood as one of its peers.
+    """Estimate how much each curve varies over its bins, and how likely peers vary as much.
 
     Args:
-        found: levels of k bins.
+        found: levels of k bins; a bin without a finite level is not used.
         curve: (k,) index of each bin's curve.
         prior_sd: prior standard deviation of the bins of a curve that does not stand out.
         part: name of this part of the data.
@@ -114,7 +114,7 @@ def compare_curves(found: Statistic, curve: np.ndarray, prior_sd: float, part: s
 
 
 def combine_curves(parts: list[Curves]) -> Curves:
-    """Combine the same curves in several parts of the data: one standard deviation for all."""
+    """Add the log-likelihoods of the same curves over several parts of the data."""
     return Curves(sum((each.log_likelihood for each in parts), np.zeros(1)),
                   sum((each.log_null for each in parts), np.zeros(1)),
                   np.any([each.judged for each in parts], axis=0),
@@ -131,7 +131,7 @@ OF_PEERS = _log_normal(LOG_GRID, PEERS_LOG_SD)  # (grid, grid), row: common stan
 
 
 def _log_null(log_likelihood: np.ndarray, judged: np.ndarray, prior_sd: float) -> np.ndarray:
-    """Compute the log likelihood (p,) of each curve as one of its peers, leave-one-out.
+    """Compute the log likelihood (p,) that each curve varies as its peers do, leave-one-out.
 
     The common standard deviation of the peers follows from the prior and all other curves, of which
     some may stand out themselves.

@@ -54,7 +54,7 @@ def permutation_p_value(level: np.ndarray, z: np.ndarray, series: Series,
 
     If the bin changes within most series, each series is rotated by a random shift, which keeps
     neighbours together; else the series exchange their means. (`scipy.stats.permutation_test`
-    does neither.) Sequential (Besag and Clifford 1991, 'Sequential Monte Carlo p-values').
+    does neither.) Stops early (Besag and Clifford 1991, 'Sequential Monte Carlo p-values').
 
     Returns:
         p-value, above 0.
@@ -88,7 +88,7 @@ def _changes_within(level: np.ndarray, starts: np.ndarray) -> bool:
 
 
 def _rotated(z: np.ndarray, starts: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Rotate the values of each series by a random shift."""
+    """Rotate the values of each series cyclically by a random shift."""
     length = np.diff(starts)
     shift = (rng.random(len(length)) * length).astype(int)
     return np.concatenate([part for start, end, by in zip(

@@ -101,11 +101,11 @@ class LastingErrors:
 
 
     def sd(self, values: np.ndarray) -> float:
-        """Estimate the standard deviation between lasting units of values (r,).
+        """Estimate the sd of the error that the values (r,) of a lasting unit, e.g. a place, share.
 
-        Analysis of variance: variance of the means of lasting units, less the part that the scatter
-        of their passing units explains. By medians, so that a group that stands out does not
-        inflate it.
+        Analysis of variance: variance of the units' means, less what the scatter of their visits
+        (passing units) explains. By medians, so that a group that stands out does not inflate it. 0
+        if too few units were visited several times.
         """
         divided, parts = self._parts >= MIN_ALIKE, self._parts
         if divided.sum() < LEAST[1]:
@@ -135,8 +135,8 @@ class Statistic:
 def medians(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
     """Compute the median (count,) of values (m,) by group (m,); NaN for an empty group.
 
-    Exact to the span of the values over 2³²: group and value are sorted as one integer, ten times
-    as fast as a sort by both.
+    Exact to 2⁻³² of the span of values: group and value are sorted as one integer, ten times as
+    fast as a sort by both.
     """
     found = np.full(count, np.nan)
     if not len(values):
@@ -159,9 +159,9 @@ def levels(values: np.ndarray, groups: Groups, lasting_sd: float,
     """Estimate the level of each group: Huber's M-estimate, one step from the median.
 
     Args:
-        values: (n,) without NaN among the members.
-        groups: k groups of them.
-        lasting_sd: standard deviation between lasting units, see `LastingErrors`.
+        values: (n,), not NaN for members of groups.
+        groups: k groups of values.
+        lasting_sd: sd of the error shared at all times, e.g. by a place, see `LastingErrors`.
         least_scale: lower bound of the scale of a group's values, e.g. their rounding step.
         is_bin: whether the groups are bins of curves, which may be small.
     """
@@ -180,9 +180,9 @@ def log_scatters(values: np.ndarray, groups: Groups, lasting_sd: float | None,
     """Estimate the log scatter of each group: log of the mean absolute deviation from its median.
 
     Args:
-        values: (n,) without NaN among the members.
-        groups: k groups of them.
-        lasting_sd: standard deviation between lasting units, of the logarithm; None: values are
+        values: (n,), not NaN for members of groups.
+        groups: k groups of values.
+        lasting_sd: sd of the log scatter between lasting units, e.g. places; None: values are
             independent.
         scale: usual scatter, the unit of the deviations, which are clipped at `MAX_SCALES`.
     """
@@ -195,7 +195,7 @@ def log_scatters(values: np.ndarray, groups: Groups, lasting_sd: float | None,
 
 
 def means(values: np.ndarray, groups: Groups, lasting_sd: float) -> Statistic:
-    """Estimate the mean of each group, e.g. its share of blanks; arguments as in `levels`.
+    """Estimate the mean of each group, e.g. its share of blank links; arguments as in `levels`.
 
     The error is at least that of independent values, with the variance of the group or of all
     values, whichever is larger.
@@ -211,11 +211,12 @@ def means(values: np.ndarray, groups: Groups, lasting_sd: float) -> Statistic:
 
 def _with_error(value: np.ndarray, step: np.ndarray, influence: np.ndarray, groups: Groups,
                 lasting_sd: float | None, is_bin: bool = False) -> Statistic:
-    """Add the standard error to a statistic (k,), and blank groups that are too small.
+    """Add standard errors to a statistic (k,) of groups; NaN where a group is too small.
 
-    Sandwich over passing units, with the influence (m,) times `step` (k,) of each member, plus the
-    error of lasting units in quadrature. `lasting_sd` None: values are independent. The sandwich of
-    bins, which have few units, is shrunk to the mean ratio over all bins.
+    Values of a passing unit share errors once, those of a lasting unit (e.g. a place) always. The
+    error is a sandwich over passing units, of the influence (m,) of members times `step` (k,), plus
+    that of lasting units in quadrature. `lasting_sd` None: values are independent. Bins have few
+    units, so their sandwich is shrunk to the mean ratio over all bins.
     """
     count = groups.count
     number = np.bincount(groups.group, minlength=count)
@@ -271,7 +272,7 @@ class PeerComparison:
         """Compute the log odds (k,) that a group differs from its peers; NaN = not judged.
 
         Args:
-            outlier_sd: scale of the Student t of the size of a group that differs.
+            outlier_sd: scale of the Student t of the distance of a group that differs.
             prior_odds: prior odds that one of all groups differs, divided among the judged groups.
         """
         total, judged = np.hypot(self.error, self.spread), np.isfinite(self.size)
@@ -281,7 +282,9 @@ class PeerComparison:
 
 
 def compare_with_peers(found: Statistic, prior_spread: float, dof: float) -> PeerComparison:
-    """Compare each group with its peers, leave-one-out, the spread of peers shrunk to a prior.
+    """Measure how far each group is from the median of its peers, which are all other groups.
+
+    The robust spread of the peers is shrunk to a prior. NaN for a group without a value.
 
     Args:
         found: statistic of k groups.
@@ -305,7 +308,7 @@ def compare_with_peers(found: Statistic, prior_spread: float, dof: float) -> Pee
     centre = np.median(peer_values, axis=1)
     noise = np.maximum(np.median(peer_squares, axis=1), TINY)
     seen = (MAD_SD * np.median(np.abs(peer_values - centre[:, None]), axis=1)) ** 2
-    # Errors are of the worst case: peers may be closer together than their errors.
+    # Errors are upper bounds: peers may scatter by less than their errors.
     weight = peers - 1.0
     usual = (weight * seen + PEER_WEIGHT * (prior_spread**2 + noise)) / (weight + PEER_WEIGHT)
     size[judged] = values - centre
@@ -349,10 +352,10 @@ def median_polish(values: np.ndarray, labels: list[np.ndarray]) -> np.ndarray:
 
 
 def subtract_end_levels(found: Statistic, ends: tuple[np.ndarray, ...]) -> Statistic:
-    """Subtract from a statistic of k pairs the levels of both ends, given by labels (k,).
+    """Subtract from the statistic of k pairs of ends what each end shows in all of its pairs.
 
-    The level of an end is the median of its pairs and one zero: an end with two pairs has a level
-    only if both are off.
+    That is the median of its pairs and one added zero: an end with two pairs has a level only if
+    both deviate. Errors grow accordingly. `ends` are the labels (k,) of the first and second ends.
     """
     judged = np.isfinite(found.value)
     value, error = found.value.copy(), found.error.copy()
@@ -370,7 +373,7 @@ def subtract_end_levels(found: Statistic, ends: tuple[np.ndarray, ...]) -> Stati
 
 
 def subtract_unit_errors(values: np.ndarray, label: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """Subtract from values (n,) the error that groups share in a unit, such as a place.
+    """Subtract from values (n,) the error that all groups share in a unit, such as a place.
 
     Two-way fit by medians, levels of groups plus errors of units; the error of a unit is shrunk to
     0, fully if only one group was in it.
@@ -378,7 +381,7 @@ def subtract_unit_errors(values: np.ndarray, label: np.ndarray, unit: np.ndarray
     Args:
         values: (n,).
         label: (n,) group.
-        unit: (n,) lasting unit, see `Units`.
+        unit: (n,) unit whose error lasts, see `Units`.
     """
     cell_of, of_group = _pairs(label, unit)
     size = np.int64(unit.max(initial=0) + 1)

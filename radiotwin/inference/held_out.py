@@ -37,7 +37,7 @@ def deal_groups(group: np.ndarray, max_folds: int, rng: np.random.Generator) -> 
 
 
 def convex_weights(error: np.ndarray, share: np.ndarray, pull: float) -> np.ndarray:
-    """Fit convex stacking weights by least squares, shrunk towards the best single prediction.
+    """Fit stacking weights (each set ≥ 0, sum 1) by least squares, shrunk to the best prediction.
 
     Minimises mean((error @ w)^2) / m + pull * |w - best|^2, summed over both sets of weights, where
     m is the mean square error of the best single prediction. With equal shares, another prediction

@@ -49,9 +49,9 @@ class Scores:
     def covariances(self, clusterings: list[np.ndarray]) -> list[np.ndarray]:
         """Compute covariances (q, q), each scaled so that ±1.645 sd is a 90 % interval.
 
-        The first is that of independent rows, then one per clustering, widened by Student's t. The
-        interval of a parameter, or of a contrast, is the widest of them. A parameter with too few
-        effective clusters keeps the standard deviation of independent rows.
+        The first is that of independent rows, then one per clustering of two or more clusters, its
+        sd widened by Student's t. The interval of a parameter, or contrast, is the widest of them.
+        With too few effective clusters, a parameter keeps the sd of independent rows.
 
         Args:
             clusterings: (n,) integer labels of rows with correlated errors, e.g. places, flights.
@@ -78,8 +78,8 @@ class Scores:
                    count: int) -> np.ndarray:
         """Compute the covariance (q, q) for clusters (n,) with independent errors.
 
-        Few clusters pull the fit towards themselves: then by the jackknife. A cluster without which
-        a parameter is left to the prior does not count for it.
+        Few clusters pull the fit towards themselves: then by the jackknife, which leaves out each
+        in turn. It skips a parameter that only the prior would determine without that cluster.
         """
         sums = _sum_by_cluster(self.score, cluster, count)
         if count > MAX_LEFT_OUT:
@@ -95,7 +95,7 @@ class Scores:
         return (count - 1) / count * moves.T @ moves
 
     def _effective_clusters(self, bread: np.ndarray, cluster: np.ndarray, count: int) -> np.ndarray:
-        """Compute the effective number of clusters (q,) of each parameter: (Σ s)² / Σ s²."""
+        """Compute the effective number of clusters (q,): (Σ s)² / Σ s² of squared influences s."""
         influence = self.root @ bread
         times = influence.shape[0] // len(cluster)
         share = _sum_by_cluster(influence**2, np.tile(cluster, times), count)

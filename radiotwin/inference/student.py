@@ -40,7 +40,7 @@ class Losses:
                         for value in (self.blank, self.drop, self.drop_db)))
 
     def states(self) -> Iterator[tuple[np.ndarray | float, np.ndarray | float]]:
-        """Yield probability and drop [dB] of each state: not dropped and, if any may, dropped."""
+        """Yield probability and drop [dB] of the state without a drop and, if any, with one."""
         if np.any(self.drop):
             yield 1.0 - self.drop, 0.0
             yield self.drop, self.drop_db
@@ -205,7 +205,7 @@ class ReadingLaw:
         return np.where(np.isnan(level_db), 0.0, dropped * self.losses.drop_db)
 
     def _state_densities(self, level_db: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Compute standardised residuals (states, n), 0 for a blank, and log P(state) density."""
+        """Compute residuals over scale (states, n), 0 for a blank, and log joint densities."""
         z, log_densities = [], []
         for probability, drop_db in self.losses.states():
             z.append(np.where(np.isnan(level_db), 0.0,

@@ -82,6 +82,7 @@ class BodyShadowing(BodyFrameEffect):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
+        """Propose the body shadow that fits each receiver's residuals, where one fits clearly."""
         links, found = view.links, {}
         usable = np.isfinite(links.heading_deg) & np.isfinite(links.level_db)
         for receiver in frequent_labels(links.receiver[usable], MIN_LINKS):
@@ -92,11 +93,12 @@ class BodyShadowing(BodyFrameEffect):
 
     @override
     def propose_like(self, view: ResidualView) -> list[Params]:
-        """Propose anew, and also the parameters from all links, which one fold hardly changes."""
+        """Propose anew from the fold's residuals, and also the parameters found on all links."""
         return [*self.propose(view), self.params]
 
     @override
     def gain_db(self, links: Links) -> np.ndarray:
+        """Compute the loss (n,) by the receivers' bodies, as negative gain [dB]."""
         gain_db = np.zeros(len(links))
         for receiver, body in self.params.receivers.items():
             rows = np.flatnonzero((links.receiver == receiver) & np.isfinite(links.heading_deg))
@@ -106,6 +108,7 @@ class BodyShadowing(BodyFrameEffect):
 
     @override
     def typical_patterns(self, view: ResidualView) -> list[Pattern]:
+        """Return the level change by a shadow 1 dB deep behind the receiver's body."""
         azimuth_deg, depth = view.links.body_azimuth_deg, quantities(Body)["depth_db"]
         if not np.isfinite(azimuth_deg).any():
             return []
@@ -170,9 +173,10 @@ def _relative_loss(cosine: np.ndarray, width_deg: float) -> np.ndarray:
 
 
 def _best_body(view: ResidualView, rows: np.ndarray) -> Body | None:
-    """Return the body of a grid that fits the residuals best; None if it gains too little.
+    """Find the shadow of a receiver's body that fits its residuals best, on a grid of shadows.
 
-    The level and, by ridge regression, the depth are fitted for each direction and width.
+    Its level and, by ridge regression, depth are fitted for each trial direction and width. None
+    if the log-likelihood gain is at most `MIN_NATS`.
     """
     few = subsample(rows, MAX_LINKS)
     weight = view.weight[few] * (len(rows) / len(few))

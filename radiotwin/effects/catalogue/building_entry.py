@@ -95,6 +95,7 @@ class BuildingEntry(GainEffect):
 
     @override
     def unavailable(self, links: Links) -> str | None:
+        """Return why entry loss cannot be fitted (frequency, too few links indoors); else None."""
         if missing := super().unavailable(links):
             return missing
         if not MIN_HZ <= links.frequency_hz <= MAX_HZ:
@@ -113,16 +114,18 @@ class BuildingEntry(GainEffect):
 
     @override
     def term(self, links: Links, level_at: LevelAt) -> Term:
+        """Return ITU-R's entry loss and its spread, times the chance that one end is indoors."""
         params = self.params
         chance = self._chance(links)
         median_db = entry_loss_db(params.frequency_hz, links.elevation_deg, params.building)
         low_db, high_db = (entry_loss_db(params.frequency_hz, 0.0, params.building, probability)
-                           for probability in (0.1587, 0.8413))  # one standard deviation apart
+                           for probability in (0.1587, 0.8413))  # -1 and +1 standard deviation
         return Term(-chance * median_db, -chance[:, None], np.array([(high_db - low_db) / 2]),
                     random_effect_sd_db=np.sqrt(chance) * params.scatter_sd_db)
 
     @override
     def implausible(self, coefficients: np.ndarray) -> str | None:
+        """Return why the entry loss is negative, tiny, or above its 99 % quantile; else None."""
         loss_db, most_db = self._loss_db(self.params, coefficients), entry_loss_db(
             self.params.frequency_hz, 0.0, self.params.building, MAX_PROBABILITY)
         if loss_db < 0:
@@ -147,12 +150,12 @@ class BuildingEntry(GainEffect):
         return float(entry_loss_db(params.frequency_hz, 0.0, params.building) + coefficients[0])
 
     def _chance(self, links: Links) -> np.ndarray:
-        """Compute the probability (n,) that exactly one end is inside a building; cached."""
+        """Compute the chance (n,) that one end only is indoors, 0 with line of sight; cached."""
         def chance_of_entry() -> np.ndarray:
             city = city_of(links, self.name)
             device = city.inside(links.device_m)[links.device]
             receiver = city.inside(links.receiver_m).astype(float)
-            measured = links.receiver >= 0  # the others are points of a map, known exactly
+            measured = links.receiver >= 0  # others are points of a map, known exactly
             receiver[measured] = chance_inside(city, links.receiver_m[measured])
             return np.where(links.los, 0.0, np.where(device, 1 - receiver, receiver))
         return self.of_links.get(links, None, chance_of_entry)

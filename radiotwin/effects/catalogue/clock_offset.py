@@ -30,7 +30,7 @@ STEP_M, MAX_M = 3.0, 120.0
 
 
 class ReceiverClockOffset(MovedEnd):
-    """Clock offset of one receiver's positions; each step finds the worst receiver."""
+    """Clock offset of one receiver's positions; each search step finds the worst receiver."""
 
     name = "receiver_clock_offset"
     in_words = "a wrong clock of the receiver"
@@ -53,6 +53,7 @@ class ReceiverClockOffset(MovedEnd):
 
     @override
     def unavailable(self, links: Links) -> str | None:
+        """Return why no clock can be tested (no times, none moves, or too many); else None."""
         if np.isfinite(links.time_s).sum() < MIN_LINKS:
             return "there is no time_s"
         moving = _speeds_m_s(links)
@@ -63,6 +64,7 @@ class ReceiverClockOffset(MovedEnd):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
+        """Propose the receiver and clock offset, a shift along its track, that fit best."""
         known = view.found_params(self.name, "receiver")
         return self.best_move(view, (
             [self.Params(receiver=receiver, offset_s=sign * size_m / speed_m_s, speed_m_s=speed_m_s)
@@ -77,6 +79,7 @@ class ReceiverClockOffset(MovedEnd):
 
     @override
     def variation(self) -> Variation:
+        """Return the clock offset [s] for the search; it moves a receiver by `MAX_M` at most."""
         params = self.params
         max_s, step_s = MAX_M / params.speed_m_s, STEP_M / params.speed_m_s
         return Variation(
@@ -107,7 +110,7 @@ def _speeds_m_s(links: Links) -> dict[int, float]:
 
 
 def _at_other_time(links: Links, receiver: int, offset_s: float) -> Links:
-    """Move the receiver of its links along its tracks by a time; links without a time stay."""
+    """Put a receiver where its track was `offset_s` later; links without a time stay."""
     receiver_m = links.receiver_m.copy()
     timed = np.flatnonzero(np.isfinite(links.time_s))
     order = timed[np.argsort(links.flight[timed], kind="stable")]

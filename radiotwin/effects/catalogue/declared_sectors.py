@@ -69,9 +69,9 @@ class OwnTurn(NamedTuple):
 
 
 def level_groups(links: Links, devices: list[int]) -> list[list[int]]:
-    """Group devices by mast, then by direction of a mast; only groups of two or more.
+    """Group devices that share a mast, then those that share a direction (an antenna) of it.
 
-    A mast with one direction is listed twice.
+    Only groups of two or more; a mast with one direction is listed twice.
     """
     found = [{tuple(other for other in group_of(links, device) if other in devices)
               for device in devices} for group_of in (site_of, antenna_of)]
@@ -79,9 +79,9 @@ def level_groups(links: Links, devices: list[int]) -> list[list[int]]:
 
 
 def unshared_sd_db(devices: list[int], groups: list[list[int]]) -> np.ndarray:
-    """Compute the standard deviation (k,) of the part of a level that no other device shares [dB].
+    """Compute the prior sd (k,) of the part of each device's level that no other has [dB].
 
-    That of the device, plus that of its mast or direction if no other device is on it.
+    The device's own variance, and that of its mast and of its direction if it is alone there.
     """
     unshared_groups = 2 - membership(devices, groups).sum(axis=1)
     return np.sqrt(DEVICE_SD_DB**2 + GROUP_SD_DB**2 * unshared_groups)
@@ -95,7 +95,7 @@ def membership(devices: list[int], groups: list[list[int]]) -> np.ndarray:
 
 def unheard_sd_db(devices: list[int], groups: list[list[int]], heard: set[int],
                   common_sd_db: float) -> dict[int, float]:
-    """Compute the standard deviation of the level of each device without a reading [dB].
+    """Compute how uncertain the level of each device without a reading is: device -> sd [dB].
 
     Conditional normal distribution given the levels of all devices with readings.
 
@@ -151,6 +151,7 @@ class DeclaredSectors(SectorEffect):
 
         @model_validator(mode="after")
         def _check_groups(self) -> Self:
+            """Reject groups with repeated or unknown devices, or a device in more than two."""
             counts = Counter(device for group in self.groups for device in group)
             if any(len(set(group)) < max(len(group), 2) for group in self.groups) \
                     or not set(counts) <= set(self.devices) or max(counts.values(), default=0) > 2:
@@ -161,6 +162,7 @@ class DeclaredSectors(SectorEffect):
 
     @override
     def unavailable(self, links: Links) -> str | None:
+        """Return why there are too few declared azimuths to use them; None if there are enough."""
         if missing := super().unavailable(links):
             return missing
         if len(_declared(links)) < MIN_DEVICES:
@@ -169,6 +171,7 @@ class DeclaredSectors(SectorEffect):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
+        """Propose the common antenna pattern and azimuth errors that fit the declared sectors."""
         declared = _declared(view.links)
         if np.isin(view.links.device, declared).sum() < MIN_LINKS:
             return []
@@ -194,6 +197,7 @@ class DeclaredSectors(SectorEffect):
 
     @override
     def implausible(self, coefficients: np.ndarray) -> str | None:
+        """Return why declared azimuths are unusable (all far off alike, or many by themselves)."""
         params = self.params
         if len(params.own_turns_deg) > len(params.devices) / 2:
             return (f"of {len(params.devices)} declared azimuths {len(params.own_turns_deg)} are "
@@ -205,6 +209,7 @@ class DeclaredSectors(SectorEffect):
 
     @override
     def contradicted_declarations(self, links: Links) -> list[str]:
+        """Return a sentence for each device whose readings contradict its declared azimuth."""
         return [f"the declared azimuth of device {links.device_names[device]}, "
                 f"{links.boresight_deg[device]:.0f}°, is contradicted by its own readings, which "
                 f"put it {turn_deg:+.0f}° (± {QUANTILE_90 * sd_deg:.0f}°) away; all azimuths share "
@@ -213,6 +218,7 @@ class DeclaredSectors(SectorEffect):
 
     @override
     def term(self, links: Links, level_at: LevelAt) -> Term:
+        """Return pattern gains [dB] and fitted levels: of all, by mast, by direction, by device."""
         by_device = super().term(links, level_at)
         shared = _shared_levels(self.params)
         sd_db = np.zeros(len(links))
@@ -226,6 +232,7 @@ class DeclaredSectors(SectorEffect):
 
     @override
     def variation(self) -> Variation:
+        """Put the pattern's shape and the common azimuth and tilt errors into a search vector."""
         params = self.params
         fields = _searched_fields()
         first = next(iter(params.devices.values()))
@@ -252,6 +259,7 @@ class DeclaredSectors(SectorEffect):
 
     @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
+        """Report shape, common and single azimuth errors [deg], and each device's gain [dB]."""
         values = self.variation().values
         reported = {name: Parameter.normal(value, sd, field["unit"], Allowed.of(field))
                     for (name, field), value, sd in zip(_searched_fields().items(), values,
@@ -283,7 +291,7 @@ class DeclaredSectorsOnPaths(DeclaredSectors):
 
 
 def _shared_levels(params: Any) -> np.ndarray:
-    """Build the indicators (k, 1 + groups) of the shared levels of each device: of all, groups."""
+    """Build indicators (k, 1 + groups) of the levels that devices share: of all, of each group."""
     devices = list(params.devices)
     return np.column_stack([np.ones(len(devices)), membership(devices, params.groups)])
 
@@ -303,9 +311,10 @@ def _declared(links: Links) -> list[int]:
 
 def _turned(links: Links, devices: list[int], shape: SectorPattern, offset_deg: float,
             own_turns: dict[int, OwnTurn]) -> dict[int, SectorPattern]:
-    """Turn a pattern to the declared azimuth and tilt of each device, plus azimuth errors.
+    """Turn a pattern to each device's declared azimuth and tilt: device -> pattern.
 
-    The tilt of `shape` is added to the declared ones; the median, or 0, replaces missing ones.
+    Azimuths get the common error `offset_deg` and the device's own. The tilt of `shape` is added;
+    a missing declared tilt is replaced by the median of the others, or 0.
     """
     known = links.tilt_deg[devices]
     usual = float(np.median(known[np.isfinite(known)])) if np.isfinite(known).any() else 0.0
@@ -334,7 +343,7 @@ class _Readings(NamedTuple):
 
     @classmethod
     def of(cls, view: ResidualView, devices: list[int], straight: bool) -> Self:
-        """Draw the subsample of each device and find its departures."""
+        """Draw some links of each device at random, and find at which angles they depart."""
         parts = {}
         for device in devices:
             device_rows = np.flatnonzero(view.links.device == device)
@@ -345,7 +354,7 @@ class _Readings(NamedTuple):
         return cls(view, devices, parts)
 
     def nats(self, offsets_db: dict[int, np.ndarray]) -> float:
-        """Compute the log-likelihood gain of offsets (r,) by device plus a common level [nats]."""
+        """Compute the log-likelihood gain of offsets (r,) by device and one fitted level [nats]."""
         rows = np.concatenate([self.parts[device][0] for device in offsets_db])
         times = np.concatenate([np.full(len(self.parts[device][0]), self.parts[device][1])
                                 for device in offsets_db])
@@ -355,11 +364,11 @@ class _Readings(NamedTuple):
         return float(times @ self.view.gain_nats(rows, offset_db + level_db))
 
     def turns(self) -> tuple[float, dict[int, OwnTurn]]:
-        """Estimate the common error of the azimuths, and the devices with another error.
+        """Estimate the common error of declared azimuths, and which devices have another error.
 
         Mixture model: each azimuth has the common error or, rarely, any error, so that a wrong
         azimuth does not bias the others. Each device has its own level; patterns are flat in
-        elevation.
+        elevation. Returns the common error [deg] and device -> its own.
         """
         found: tuple[float, dict[int, OwnTurn]] = (0.0, {})
         view = self.view
@@ -380,9 +389,10 @@ class _Readings(NamedTuple):
 
     def _mixture(self, width_deg: float, back_db: float
                  ) -> tuple[float, float, dict[int, np.ndarray], SectorPattern]:
-        """Fit the mixture with one flat pattern: log-likelihood [nats], common error [deg].
+        """Rate one pattern, flat in elevation, by the mixture of `turns` over azimuth errors.
 
-        And device -> gain of each trial error (t,) [nats], and the pattern.
+        Returns log-likelihood [nats], most likely common error [deg], device -> gain of each trial
+        error (t,) [nats], and the pattern.
         """
         shape = SectorPattern(beamwidth_deg=width_deg, front_to_back_db=back_db)
         declared = _turned(self.view.links, self.devices, shape, 0.0, {})
@@ -399,7 +409,7 @@ class _Readings(NamedTuple):
 
     def best_shape(self, offset_deg: float, own_turns: dict[int, OwnTurn]
                    ) -> tuple[float, SectorPattern]:
-        """Find the pattern of the grid with the highest gain over a constant level [nats]."""
+        """Return the highest gain over a constant level [nats], and the trial pattern with it."""
         def rate_shape(width: float, back_db: float, tilt: float, height: float
                        ) -> tuple[float, SectorPattern]:
             shape = SectorPattern(beamwidth_deg=width, front_to_back_db=back_db, tilt_deg=tilt,
@@ -416,9 +426,10 @@ class _Readings(NamedTuple):
 
 
 def _chance_wrong(nats: np.ndarray, common_deg: float) -> float:
-    """Compute the posterior probability that an azimuth is wrong, from the nats (t,) of turns.
+    """Compute the posterior probability that the declared azimuth of a device is wrong.
 
-    An error within `MAX_TURN_DEG` of the common one is not wrong.
+    Wrong: its error differs by more than `MAX_TURN_DEG` from the common one. `nats` (t,) are the
+    log-likelihood gains of trial errors `TURNS_DEG`.
     """
     apart_deg = np.abs((TURNS_DEG - common_deg + 180) % 360 - 180)
     share = np.exp(nats - nats.max())
@@ -428,7 +439,7 @@ def _chance_wrong(nats: np.ndarray, common_deg: float) -> float:
 
 
 def _own_turn(nats: np.ndarray, common_deg: float) -> OwnTurn:
-    """Estimate an azimuth's error minus the common one: posterior mean and sd near the maximum."""
+    """Estimate how far a device's azimuth error is from the common one, with its sd [deg]."""
     best_deg, share = TURNS_DEG[nats.argmax()], np.exp(nats - nats.max())
     off_deg = (TURNS_DEG - best_deg + 180) % 360 - 180
     mean_deg = share @ off_deg / share.sum()

@@ -45,6 +45,7 @@ class DetectionLimit(LimitEffect):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
+        """Propose receivers whose readings clearly end above their declared limit of detection."""
         links, found, sd_db = view.links, {}, {}
         seen = np.isfinite(links.level_db)
         for receiver in np.unique(links.receiver):

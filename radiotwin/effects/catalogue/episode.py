@@ -70,7 +70,7 @@ class _Window(NamedTuple):
 
 
 class Episode(GainEffect):
-    """A loss or an attenuation between two times; each step finds the strongest."""
+    """A loss or an attenuation between two times; each search step finds the strongest."""
 
     name = "episode"
     in_words = "something that lasted for a while, such as rain"
@@ -104,6 +104,7 @@ class Episode(GainEffect):
 
     @override
     def unavailable(self, links: Links) -> str | None:
+        """Return why no passing loss can be searched (no times, or one flight only); else None."""
         if np.isfinite(links.time_s).sum() < MIN_LINKS:
             return "there is no time_s"
         if len(np.unique(links.flight)) < 2:
@@ -112,6 +113,7 @@ class Episode(GainEffect):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
+        """Propose the two strongest passing losses, of one receiver or of all at once."""
         links, found = view.links, []
         rest_db, known = compared_where_possible_db(view)
         value_db, weight = by_precision(view, rest_db)
@@ -127,7 +129,7 @@ class Episode(GainEffect):
 
     @override
     def propose_like(self, view: ResidualView) -> list[Params]:
-        # The times are estimated again: those from all links would contain the held-out ones.
+        """Propose the same episode for a fold, its times estimated anew, without held-out links."""
         value_db, weight = by_precision(view, compared_where_possible_db(view)[0])
         rows = _timed_rows(view.links, self.params.receiver, self.params.flight)
         window = _strongest(view.links, value_db, weight, rows) \
@@ -140,7 +142,11 @@ class Episode(GainEffect):
     def _proposed(self, links: Links, value_db: np.ndarray, weight: np.ndarray,
                   known: np.ndarray, receiver: int | None, flight: str | None,
                   ) -> tuple[float, Params] | None:
-        """Return gain [nats] and parameters of the best episode; None if it does not stand out."""
+        """Return gain [nats] and parameters of the strongest episode; None if it is doubtful.
+
+        Doubtful: a small gain, most devices or receivers do not show it, it may be a step in time
+        or a bad flight, or other times differ as much.
+        """
         rows = _timed_rows(links, receiver, flight)
         window = _strongest(links, value_db, weight, rows) if len(rows) >= MIN_LINKS else None
         if window is None or window.nats < MIN_NATS:
@@ -164,6 +170,7 @@ class Episode(GainEffect):
 
     @override
     def implausible(self, coefficients: np.ndarray) -> str | None:
+        """Return why the loss is negative, or more than air and rain take; None if plausible."""
         params = self.params
         if coefficients[0] < 0:
             unit = "dB" if params.form == "loss" else "dB/km"
@@ -178,6 +185,7 @@ class Episode(GainEffect):
 
     @override
     def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:
+        """Yield a loss of 1 dB during part of the time of one receiver, for several receivers."""
         links = view.links
         for of_receiver in timed_members(links, links.receiver):
             # Quantiles of the readings' times: half of the duration may be between two flights.
@@ -189,6 +197,7 @@ class Episode(GainEffect):
 
     @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
+        """Report the loss [dB or dB/km], its start and its end [s], with 90 % intervals."""
         params = self.params
         who = "all" if params.receiver is None else links.receiver_names[params.receiver]
         member = f"[{who}]" if params.flight is None else f"[{who}, flight {params.flight}]"
@@ -225,10 +234,10 @@ def _timed_rows(links: Links, receiver: int | None, flight: str | None) -> np.nd
 
 def _strongest(links: Links, values_db: np.ndarray, weights: np.ndarray,
                rows: np.ndarray) -> _Window | None:
-    """Find the window in which a loss or an attenuation has the highest gain, among rows (r,).
+    """Find the window of time in which a loss explains the residuals best, among rows (r,).
 
-    From compared residuals (n,) and weights (n,). Two passes: coarse times over all of the data,
-    then all times near the ends that were found.
+    From residuals relative to other flights (n,) and weights (n,). The loss is constant or grows
+    with distance. Two passes: coarse times over all data, then all times near the ends found.
     """
     time_s, rest_db, weight = links.time_s[rows], values_db[rows], weights[rows]
     distance_km = links.distance_m[rows] / 1000
@@ -247,7 +256,7 @@ def _strongest(links: Links, values_db: np.ndarray, weights: np.ndarray,
 
 def _best_window(ends_s: np.ndarray, time_s: np.ndarray, rest_db: np.ndarray, weight: np.ndarray,
                  distance_km: np.ndarray) -> _Window | None:
-    """Find the best window from one trial time to just before another; None if none is allowed."""
+    """Find the window between two of the times `ends_s` with the likeliest loss, or None."""
     cell = np.searchsorted(ends_s, time_s, side="right") - 1
     count = _sums(cell, np.ones(len(cell)), len(ends_s))
     inside = count[None, :] - count[:, None]
@@ -276,7 +285,7 @@ def _best_window(ends_s: np.ndarray, time_s: np.ndarray, rest_db: np.ndarray, we
             last_s = np.full(len(ends_s), -np.inf)  # time of the last reading in each cell
             np.maximum.at(last_s, cell, time_s)
             last_s = np.r_[-np.inf, np.maximum.accumulate(last_s)]
-            # It began after the last reading before it, and ended before the next one after it.
+            # Begin: after the reading before the window; end: before the reading behind it.
             best = _Window(
                 float(nats[start, end]), float(ends_s[start]), float(last_s[end]),
                 (float(last_s[starts[0]] if starts[0] else ends_s[0]), float(ends_s[starts[-1]])),
@@ -292,11 +301,11 @@ def _sums(cell: np.ndarray, value: np.ndarray, cells: int) -> np.ndarray:
 
 def _most_members_agree(links: Links, value_db: np.ndarray, weight: np.ndarray, known: np.ndarray,
                         rows: np.ndarray, inside: np.ndarray) -> bool:
-    """Check whether most devices, and most receivers, show the change in the window.
+    """Check whether most devices, and most receivers, show the loss in the window of time.
 
-    Without other flights at these places an obstacle could be the cause: it hides few sites at
-    once, so several sites must agree; it hides all of them from a street, so receivers at street
-    level must have been at many places.
+    If few links have other flights at the same place to compare with (`known`), an obstacle could
+    be the cause: it hides few masts at once, so several must show the loss; it hides all of them
+    from a street, so receivers at street level must have been at many places.
     """
     during, others = rows[inside[rows]], rows[~inside[rows]]
     if known[during].mean() < MIN_KNOWN:
@@ -336,7 +345,7 @@ def _is_step_or_flight(links: Links, params: Any, inside: np.ndarray) -> bool:
 
 def _is_unique(links: Links, value_db: np.ndarray, weight: np.ndarray, rows: np.ndarray,
                inside: np.ndarray, nats: float) -> bool:
-    """Check whether no other window differs as much.
+    """Check whether no other window of time differs as much from the usual level.
 
     By Student's t against windows of the same length; if there are fewer than `FEW_WINDOWS`, by the
     gain against the best other window of any length.

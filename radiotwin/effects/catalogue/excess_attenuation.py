@@ -55,6 +55,7 @@ class ExcessAttenuation(GainEffect):
 
     @override
     def term(self, links: Links, level_at: LevelAt) -> Term:
+        """Return the column -(distance [km] × mean relative density); its coefficient is dB/km."""
         height_m = self.params.scale_height_m
         low = np.minimum(links.device_m[links.device, 2], links.receiver_m[:, 2])
         rise = np.maximum(np.abs(links.offset_m[:, 2]), 1e-3) / height_m
@@ -70,11 +71,12 @@ class ExcessAttenuation(GainEffect):
 
     @override
     def neg_log_prior(self) -> float:
-        # Flights at one height do not determine it: prefer the lower of profiles that fit equally.
+        # Flights at one height cannot tell the scale height: of equal fits, prefer a low one.
         return 0.5 * (np.log(self.params.scale_height_m / TREES_M) / HEIGHT_SD) ** 2
 
     @override
     def implausible(self, coefficients: np.ndarray) -> str | None:
+        """Return why the attenuation is negative or beyond air, rain and woodland; else None."""
         params = self.params
         if coefficients[0] < 0:
             return f"it would have to amplify, by {-coefficients[0]:.1f} dB/km"
@@ -90,6 +92,7 @@ class ExcessAttenuation(GainEffect):
 
     @override
     def typical_patterns(self, view: ResidualView) -> list[Pattern]:
+        """Return a loss of 1 dB/km on all links, at all heights alike."""
         links = view.links
         most_db_km = max_at_ground_db_km(links.frequency_hz, MAX_HEIGHT_M) \
             if np.isfinite(links.frequency_hz) else np.inf
@@ -98,6 +101,7 @@ class ExcessAttenuation(GainEffect):
 
     @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
+        """Report attenuation at the ground [dB/km], and its fall with height (scale height) [m]."""
         return {"specific_attenuation_db_km": Parameter.normal(
                     estimate.coefficients[0], estimate.coefficients_sd[0], "dB/km",
                     Allowed(low=0.0)),
@@ -107,10 +111,10 @@ class ExcessAttenuation(GainEffect):
 
 
 def max_at_ground_db_km(frequency_hz: float, scale_height_m: float) -> float:
-    """Compute the upper bound of the specific attenuation at the ground [dB/km].
+    """Compute the largest plausible attenuation at the ground: gas, rain and woodland [dB/km].
 
-    Gas plus rain plus woodland; the latter such that a vertical path through the profile loses as
-    much below `TREES_M` as through trees of that height.
+    Woodland is spread over the height profile: a vertical path loses as much below `TREES_M` as
+    through trees of that height.
 
     Args:
         frequency_hz: carrier frequency [Hz].

@@ -81,7 +81,7 @@ class _Flight:
 
 
 class FaultyFlight(GainEffect):
-    """One flight that disagrees with all others; each step finds the worst."""
+    """One flight that disagrees with all others; each search step finds the worst."""
 
     name = "faulty_flight"
     in_words = "a fault on that flight"
@@ -107,6 +107,7 @@ class FaultyFlight(GainEffect):
 
     @override
     def unavailable(self, links: Links) -> str | None:
+        """Return why there are too few flights to call one faulty; None if there are enough."""
         pairs = np.unique(np.column_stack([links.receiver, links.flight]), axis=0)
         most = np.unique(pairs[:, 0], return_counts=True)[1].max()
         if most < 2 or (most < MIN_FLIGHTS and len(pairs) < MIN_ALL_FLIGHTS):
@@ -116,6 +117,7 @@ class FaultyFlight(GainEffect):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
+        """Propose the flight, of one receiver or of all, that disagrees most with the others."""
         known = list(zip(view.found_params(self.name, "receiver"),
                          view.found_params(self.name, "flight"), strict=True))
         flights = _flights(view)
@@ -132,7 +134,7 @@ class FaultyFlight(GainEffect):
             return []
         worst = min(found.values(), key=lambda faults: min(p_value for p_value, _, _ in faults))
         receivers = {flight.receiver for flight in flights if flight.flight == worst[0][2].flight}
-        if not 1 < len(receivers) == len(worst):  # not all its receivers: the worst one
+        if not 1 < len(receivers) == len(worst):  # not all receivers: take the worst
             worst = [min(worst, key=lambda fault: fault[0])]
         rows = np.concatenate([flight.rows for _, _, flight in worst])
         return [self.Params(
@@ -148,6 +150,7 @@ class FaultyFlight(GainEffect):
 
     @override
     def term(self, links: Links, level_at: LevelAt) -> Term:
+        """Return a flight's fitted offset and slope against the prediction, and its added noise."""
         rows = np.flatnonzero(flight_mask(links, self.params.receiver, self.params.flight))
         columns, noise_db = np.zeros((len(links), 2)), np.zeros(len(links))
         columns[rows, 0] = 1.0
@@ -160,6 +163,7 @@ class FaultyFlight(GainEffect):
 
     @override
     def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:
+        """Yield a loss of 1 dB on one flight of one receiver, for several flights."""
         links = view.links
         flights = members(links.track)
         between = [mask for mask in flights if not is_first_or_last(
@@ -170,6 +174,7 @@ class FaultyFlight(GainEffect):
 
     @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
+        """Report the flight's offset [dB], added noise [dB], and slope against the prediction."""
         receiver = self.params.receiver
         who = "all" if receiver is None else links.receiver_names[receiver]
         member = f"[{who}, flight {self.params.flight}]"
@@ -182,7 +187,7 @@ class FaultyFlight(GainEffect):
 
 
 def _flights(view: ResidualView) -> list[_Flight]:
-    """Compute the statistics of each receiver's flights with enough detected links."""
+    """Compute level, scatter and roughness of each receiver's flights with enough readings."""
     links = view.links
     seen = np.isfinite(links.level_db)
     pairs = np.unique(np.column_stack([links.receiver, links.flight])[seen], axis=0)
@@ -206,7 +211,10 @@ def _flights(view: ResidualView) -> list[_Flight]:
 
 def _levels_db(value_db: np.ndarray, weight: np.ndarray, rows: list[np.ndarray],
                receiver: np.ndarray, links: Links) -> np.ndarray:
-    """Compute levels (f,) of flights minus their receiver's median; NaN if devices disagree."""
+    """Compute the mean residual (f,) of each flight, minus its receiver's median flight [dB].
+
+    NaN if too few links have a weight, or if most devices do not show the difference.
+    """
     known = [of_flight[weight[of_flight] > 0] for of_flight in rows]
     level_db = np.array([mean_by_precision(value_db[of_flight], weight[of_flight])
                          if len(of_flight) >= MIN_LINKS else np.nan for of_flight in known])
@@ -222,8 +230,8 @@ def _levels_db(value_db: np.ndarray, weight: np.ndarray, rows: list[np.ndarray],
 
 def _devices_agree(value_db: np.ndarray, weight: np.ndarray, level_db: float,
                    device: np.ndarray) -> bool:
-    """Check whether most devices show the level of the flight."""
-    if len(np.unique(device)) > len(device) / MIN_DEVICE_LINKS:  # positions of a moving device
+    """Check whether most devices differ as the flight does: by 0.4 of its level or more."""
+    if len(np.unique(device)) > len(device) / MIN_DEVICE_LINKS:  # places of a moving device
         return True
     return share_alike(device, value_db, weight, MIN_DEVICE_LINKS, 0.4 * level_db) >= MIN_DEVICES
 
@@ -242,7 +250,7 @@ def _steps_db(residual_db: np.ndarray, links: Links) -> np.ndarray:
 
 
 def _disagreement(flight: _Flight, flights: list[_Flight], links: Links) -> tuple[float, float]:
-    """Compute the p-value of a flight's disagreement, and its additional scatter [dB]."""
+    """Compute the p-value that a flight is like others, over all tests, and added scatter [dB]."""
     others = [other for other in flights if other.flight != flight.flight]
     noisy = [_excess_scatter(log_scatter, np.array([other.log_scatters[kind] for other in others]),
                              prior_sd)
@@ -256,7 +264,10 @@ def _disagreement(flight: _Flight, flights: list[_Flight], links: Links) -> tupl
 
 
 def _excess_scatter(log_scatter: float, usual: np.ndarray, prior_sd: float) -> tuple[float, float]:
-    """Compute the p-value of a log scatter against others (m,), and the additional scatter [dB]."""
+    """Test whether a flight's log scatter exceeds that of others (m,): p-value, added scatter [dB].
+
+    p = 1 if others are too few, or if the scatter is not `MIN_SCATTER` times their median.
+    """
     usual = usual[np.isfinite(usual)]
     if np.isnan(log_scatter) or len(usual) < MIN_FLIGHTS - 1:
         return 1.0, 0.0
@@ -271,7 +282,11 @@ def _excess_scatter(log_scatter: float, usual: np.ndarray, prior_sd: float) -> t
 
 
 def _offset_p_value(flight: _Flight, others: list[_Flight], kind: int, links: Links) -> float:
-    """Compute the p-value of a flight's level against others'; 1 if it is small or unknown."""
+    """Compute the p-value of a flight's mean residual against its receiver's other flights.
+
+    1 if there are too few, or if the difference is below `MIN_OFFSET_DB`. `kind` 0 takes residuals
+    relative to other flights at the same place, 1 plain ones.
+    """
     known = [other for other in others if np.isfinite(other.levels_db[kind])]
     level_db = np.array([other.levels_db[kind] for other in known])
     receiver = np.array([other.receiver for other in known])

@@ -53,7 +53,7 @@ class VegetationLoss(NamedTuple):
 
 
 class Foliage(GainEffect):
-    """A box of vegetation; each step finds one."""
+    """A box of vegetation; each search step finds one."""
 
     name = "foliage"
     in_words = "vegetation"
@@ -76,6 +76,7 @@ class Foliage(GainEffect):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
+        """Propose boxes of vegetation where links lack power, at the best places of the ground."""
         links = view.links
         nats = obstruction_nats(view.residual_db, view.scale_db, LOSSES_DB) / view.design_effect
         centres_m, total_nats = back_project(*ends_above_ground(links), nats)
@@ -97,6 +98,7 @@ class Foliage(GainEffect):
 
     @override
     def variation(self) -> Variation:
+        """Put the box and the logarithms of attenuation and greatest loss into a search vector."""
         x_m, y_m = self.params.box[:2]
         low = [x_m - 80, y_m - 80, 5.0, 5.0, MIN_HEIGHT_M, -90.0, np.log(0.05),
                np.log(min(3.0, self.params.ceiling_db))]
@@ -121,6 +123,7 @@ class Foliage(GainEffect):
 
     @override
     def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:
+        """Yield the loss by a grove, 1 dB through its middle, for several places."""
         for inside_m in lengths_in_boxes(view.links, TYPICAL_HEIGHT_M):
             yield Pattern("place", "dB", f"of a grove {WIDE_M:.0f} m wide and "
                           f"{TYPICAL_HEIGHT_M:.0f} m high, through its middle",
@@ -129,6 +132,7 @@ class Foliage(GainEffect):
 
     @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
+        """Report the box [m, deg], its attenuation [dB/m] and its greatest loss [dB]."""
         variation = self.variation()
         low, high = variation.low.tolist(), variation.high.tolist()
         reported = {name: Parameter.normal(value, sd, "deg" if name == "turn_deg" else "m",

@@ -120,6 +120,7 @@ class _GainDrift(GainEffect):
 
     @override
     def unavailable(self, links: Links) -> str | None:
+        """Return why no drift can be searched (no times, or flights have no order); else None."""
         if np.isfinite(links.time_s).sum() < MIN_LINKS:
             return "there is no time_s"
         if links.time_restarts and "warm_up_each_flight" not in self._forms:
@@ -138,7 +139,7 @@ class _GainDrift(GainEffect):
         return self._proposals(view, list(self.drifts()))
 
     def _proposals(self, view: ResidualView, members: list[int]) -> list[Any]:
-        """Propose the drifts of these members with the highest gains."""
+        """Propose the likeliest drift of each receiver (or device), `MAX_PROPOSALS` at most."""
         links, found = view.links, []
         for member in members:
             rows = np.flatnonzero((self.index(links) == member) & np.isfinite(links.time_s))
@@ -158,6 +159,7 @@ class _GainDrift(GainEffect):
 
     @override
     def term(self, links: Links, level_at: LevelAt) -> Term:
+        """Return each drift's course in time and a constant, both of fitted size [dB]."""
         params = self.params
         columns, time_s = [], links.time_s
         if not self.of_receiver and params.span_s:  # a map, without times, shows the latest state
@@ -171,6 +173,7 @@ class _GainDrift(GainEffect):
 
     @override
     def variation(self) -> Variation | None:
+        """Return the log time constants of warm-ups for the search; None if there is no warm-up."""
         drifts = self.drifts()
         warming = [member for member, drift in drifts.items() if drift.form in WARM_UPS]
         if not warming:
@@ -191,6 +194,7 @@ class _GainDrift(GainEffect):
 
     @override
     def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:
+        """Yield a rise of 1 dB from first to last time of one receiver or device, for several."""
         time_s = view.links.time_s
         for mask in timed_members(view.links, self.index(view.links)):
             first_s, last_s = np.nanmin(time_s[mask]), np.nanmax(time_s[mask])
@@ -199,6 +203,7 @@ class _GainDrift(GainEffect):
 
     @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
+        """Report each drift's amplitude [dB], and its time constant or time of step [s]."""
         result, names = {}, getattr(links, f"{self.end}_names")
         log_sd = iter(estimate.params_sd)
         for number, (member, (form, value)) in enumerate(self.drifts().items()):
@@ -261,6 +266,7 @@ class DeviceDrift(_GainDrift):
 
     @override
     def unavailable(self, links: Links) -> str | None:
+        """Return why no device can be tested (too many, too few links or flights); else None."""
         members = self._members(links)
         if len(members) > MAX_DEVICES:
             return f"{len(members)} devices are too many to examine each; at most {MAX_DEVICES}"
@@ -270,7 +276,7 @@ class DeviceDrift(_GainDrift):
 
 def _shape(drift: Drift, links: Links, time_s: np.ndarray,
            span_s: tuple[float, float] | None) -> np.ndarray:
-    """Compute the drift (n,) at times (n,) [s] for an amplitude of 1."""
+    """Compute drifts (n,) of amplitude 1 at times (n,) [s]; ageing rises by 1 over `span_s`."""
     form, number = drift
     if form == "warm_up":
         return np.exp(-(time_s - links.first_s) / number)
@@ -278,12 +284,12 @@ def _shape(drift: Drift, links: Links, time_s: np.ndarray,
         return np.exp(-links.time_in_flight_s / number)
     if form == "step":
         return (time_s >= number).astype(float)
-    low, high = span_s or (np.nanmin(time_s), np.nanmax(time_s))  # files need not have it
+    low, high = span_s or (np.nanmin(time_s), np.nanmax(time_s))  # a twin's file may lack the span
     return (time_s - number) / max(high - low, 1.0)
 
 
 def _gap_s(links: Links, rows: np.ndarray, when_s: float) -> tuple[float, float]:
-    """Return the times of the last reading before and the first one after a step [s]."""
+    """Return the times of the last reading before a step and of the first one after it [s]."""
     time_s = links.time_s[rows & np.isfinite(links.time_s) & np.isfinite(links.level_db)]
     before, after = time_s[time_s < when_s], time_s[time_s >= when_s]
     return (float(before.max()) if len(before) else when_s,
@@ -292,10 +298,10 @@ def _gap_s(links: Links, rows: np.ndarray, when_s: float) -> tuple[float, float]
 
 def _candidates(links: Links, residual_db: np.ndarray, weight: np.ndarray,
                 between_flights: bool) -> Iterator[tuple[float, str, float]]:
-    """Yield (gain [nats], form, number) of each drift that one member's times allow.
+    """Yield (gain [nats], form, number) of each drift that a receiver's or device's times allow.
 
-    `between_flights` restricts steps to gaps between flights: within one, position changes with
-    time.
+    The number is a time constant or a time [s]. `between_flights` restricts steps to gaps between
+    flights: within one, position changes with time.
     """
     time_s, comparable = links.time_s, not links.time_restarts
     yield 0.0, "step", float(time_s.mean())

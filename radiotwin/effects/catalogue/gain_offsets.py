@@ -54,6 +54,7 @@ class _GainOffset(GainEffect):
 
     @override
     def unavailable(self, links: Links) -> str | None:
+        """Return why offsets cannot be compared (fewer than two, or too many); else None."""
         members = frequent_labels(self._index(links), MIN_LINKS)
         if len(members) < 2:
             return f"needs two {self.end}s with {MIN_LINKS} links each, to compare them"
@@ -65,7 +66,7 @@ class _GainOffset(GainEffect):
     @override
     def propose(self, view: ResidualView) -> list[Params]:
         if len(frequent_labels(self._index(view.links), MIN_LINKS)) < 2:
-            return []  # a fold may have fewer than all links
+            return []  # a fold may have too few links
         return self._of_members(view, view.in_group(self._index(view.links)))
 
     @override
@@ -73,7 +74,7 @@ class _GainOffset(GainEffect):
         return self._of_members(view, self.params.members)
 
     def _of_members(self, view: ResidualView, among: list[int]) -> list[Params]:
-        """Propose offsets of members with enough links, with the sd of their mean residuals."""
+        """Propose offsets of those in `among` with enough links, and the sd of mean residuals."""
         index = self._index(view.links)
         members = [member for member in frequent_labels(index, MIN_LINKS) if member in among]
         if not members:
@@ -91,6 +92,7 @@ class _GainOffset(GainEffect):
 
     @override
     def same_as(self, links: Links, parameters: Mapping[str, Parameter]) -> list[str]:
+        """Name the offset of the other end, if these links cannot tell which end has it."""
         names = getattr(links, f"{self.end}_names")
         largest = max(self.params.members,
                       key=lambda member: abs(parameters[f"offset_db[{names[member]}]"].value))
@@ -105,6 +107,7 @@ class _GainOffset(GainEffect):
 
     @override
     def implausible(self, coefficients: np.ndarray) -> str | None:
+        """Return a sentence if all offsets are within an instrument's tolerance; else None."""
         largest_db = np.abs(_relative_db(coefficients)).max()
         if largest_db < MIN_OFFSET_DB:
             return (f"none of them is off by more than {largest_db:.1f} dB, which is within any "
@@ -113,7 +116,7 @@ class _GainOffset(GainEffect):
 
     @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
-        # Relative to the median member: a common offset is the channel's intercept.
+        """Report each offset minus the median one [dB]: what all share is the channel's level."""
         order = np.argsort(estimate.coefficients)
         median = order[len(order) // 2]
         contrast = np.eye(len(order))
@@ -168,5 +171,5 @@ class ReceiverGainOffset(_GainOffset):
 
 
 def _relative_db(coefficients: np.ndarray) -> np.ndarray:
-    """Subtract from offsets (q,) their median; a single one is relative to all other members."""
+    """Subtract from offsets (q,) their median; a single one is relative to the others already."""
     return coefficients - np.median(coefficients) if len(coefficients) > 1 else coefficients

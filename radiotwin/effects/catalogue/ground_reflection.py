@@ -65,6 +65,7 @@ class GroundReflection(GainEffect):
 
     @override
     def unavailable(self, links: Links) -> str | None:
+        """Return why no ground reflection can be fitted (frequency, or few links in sight)."""
         if not np.isfinite(links.frequency_hz):
             return "the frequency is not known; give frequency_hz in devices.csv"
         if links.los.sum() < MIN_LINKS:
@@ -73,6 +74,7 @@ class GroundReflection(GainEffect):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
+        """Propose ground height, roughness and strength of a reflection that fit the residuals."""
         rows = subsample(np.flatnonzero(view.links.los), MAX_PROPOSE_LINKS)
         part, weight = view.links.select(rows), view.weight[rows]
         share = view.links.los.sum() / max(len(rows), 1)
@@ -95,6 +97,7 @@ class GroundReflection(GainEffect):
 
     @override
     def gain_db(self, links: Links) -> np.ndarray:
+        """Compute the level (n,) of direct plus ground-reflected ray over the direct one [dB]."""
         offset_db = np.zeros(len(links))
         clear, device_m, receiver_m = self.of_links.get(links, None, lambda: _bounces(links))
         rows = np.flatnonzero(clear)
@@ -105,6 +108,7 @@ class GroundReflection(GainEffect):
 
     @override
     def variation(self) -> Variation:
+        """Put the reflection's strength, roughness and ground height [m] into a search vector."""
         names, wavelength_m = ("strength", "roughness_m", "ground_m"), self.params.wavelength_m
         return Variation(
             np.array([getattr(self.params, name) for name in names]),
@@ -120,7 +124,7 @@ class GroundReflection(GainEffect):
 
 
 def _bounces(links: Links) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find which links (n,) have both rays, and their ends (n, 3) relative to a plane z = 0 [m]."""
+    """Find which links (n,) have a ground reflection, and both ends (n, 3) above its plane [m]."""
     device_m = links.device_m[links.device]
     if links.city is not None and links.city.terrain is not None:
         return bounces_on_terrain(links.city, device_m, links.receiver_m, links.los)
@@ -169,7 +173,7 @@ def bounces_on_terrain(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarr
 
 
 def _slope_normals(city: CityMap, points_m: np.ndarray) -> np.ndarray:
-    """Compute the upward unit normals (n, 3) of a terrain, over `SLOPE_M` to each side."""
+    """Compute unit normals (n, 3), upward, of the terrain, from its slope over ±`SLOPE_M`."""
     rise = []
     for aside_m in SLOPE_M * np.eye(2):
         forth, back = points_m[:, :2] + aside_m, points_m[:, :2] - aside_m
@@ -180,7 +184,7 @@ def _slope_normals(city: CityMap, points_m: np.ndarray) -> np.ndarray:
 
 
 def _has_bounce(links: Links) -> np.ndarray:
-    """Check which links (n,) have both the direct ray and the one off flat ground."""
+    """Check which links (n,) have a direct ray and an unblocked reflection off flat ground."""
     clear = links.los.copy()
     if links.city is not None:
         a_m, b_m = links.device_m[links.device[clear]], links.receiver_m[clear]
@@ -204,7 +208,7 @@ def two_ray_db(device_m: np.ndarray, receiver_m: np.ndarray, frequency_hz: float
         roughness_m: standard deviation of the surface's height [m].
         ground_m: height of the plane [m].
     """
-    from radiotwin.propagation.paths.interactions import (  # late: numba
+    from radiotwin.propagation.paths.interactions import (  # imported late: loads numba
         VACUUM_PERMITTIVITY_F_M,
         fresnel,
     )

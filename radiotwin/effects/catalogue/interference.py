@@ -32,7 +32,7 @@ MIN_NATS = 4.0  # log-likelihood gain above which an emitter is proposed
 
 
 class Interference(ReceiverEffect):
-    """One emitter that all reading ends hear."""
+    """One emitter that interferes at every end that reads levels."""
 
     name = "interference"
     in_words = "an emitter beside the devices"
@@ -58,6 +58,7 @@ class Interference(ReceiverEffect):
 
     @override
     def unavailable(self, links: Links) -> str | None:
+        """Return why no emitter can be located (readings at too few positions); else None."""
         positions = np.unique((_reading_m(links)[:, :2] / SAME_POSITION_M).round(), axis=0)
         if len(positions) < MIN_POSITIONS:
             return (f"levels were read at {len(positions)} positions; {MIN_POSITIONS} are needed "
@@ -66,6 +67,7 @@ class Interference(ReceiverEffect):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
+        """Propose places and powers of an interfering emitter that fit best, from a grid."""
         links = view.links
         low = _reading_m(links)[:, :2].min(axis=0) - AROUND_M
         high = _reading_m(links)[:, :2].max(axis=0) + AROUND_M
@@ -93,7 +95,7 @@ class Interference(ReceiverEffect):
 
     @override
     def propose_like(self, view: ResidualView) -> list[Params]:
-        """Propose anew, and also the parameters from all links, which one fold hardly changes."""
+        """Propose anew from the fold's residuals, and also the parameters found on all links."""
         return [*self.propose(view), self.params]
 
     @override
@@ -109,6 +111,7 @@ class Interference(ReceiverEffect):
 
     @override
     def variation(self) -> Variation:
+        """Put the emitter's x and y [m] and level [dB] into a search vector."""
         level_db = self.params.level_db
         low, high = np.reshape(self.params.within_m, (2, 2)).tolist()
 
@@ -121,6 +124,7 @@ class Interference(ReceiverEffect):
 
     @override
     def implausible(self, coefficients: np.ndarray) -> str | None:
+        """Return why the emitter's place is unknown, at the edge of the searched area; or None."""
         low, high = np.reshape(self.params.within_m, (2, 2))
         if (np.minimum(self.params.place_m - low, high - self.params.place_m) < EDGE_M).any():
             return ("the emitter would be at the edge of the searched area or beyond: its position "
@@ -148,9 +152,9 @@ def _reading_m(links: Links) -> np.ndarray:
 
 def _path_gain_db(links: Links, position_m: Sequence[float] | np.ndarray,
                   level_at: LevelAt | None) -> np.ndarray:
-    """Compute the gain (n,) from an emitter to the reading ends, by the channel or free space [dB].
+    """Compute the gain (n,) from an emitter near the ground to the end that reads each level [dB].
 
-    In free space it is relative to that at `REFERENCE_M`.
+    By the channel, or without `level_at` in free space, relative to the gain at `REFERENCE_M`.
     """
     ground_m = 0.0 if links.city is None else float(links.city.ground_height_m(*position_m))
     emitter_m = np.array([*position_m, ground_m + HEIGHT_M])
@@ -164,13 +168,13 @@ def _path_gain_db(links: Links, position_m: Sequence[float] | np.ndarray,
 
 def _gains_nats(view: ResidualView, rows: np.ndarray,
                 positions_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the gain of p trial emitters with q levels each on the residuals of rows (r,).
+    """Compute the log-likelihood gains of p trial emitters with q powers each, over rows (r,).
 
-    Half of the reduction of the weighted squares. A level and a slope per class of sight are fitted
-    in addition, as those of the channel already absorbed part of the interference.
+    Half of the reduction of the weighted squared residuals. A level and a slope, each with and
+    without sight, are fitted as well: the channel's own have absorbed part of the interference.
 
     Returns:
-        (p, q) gains [nats], and (p, q) levels [dB].
+        (p, q) gains [nats], and (p, q) levels of the emitters [dB].
     """
     part = view.links.select(rows)
     root = np.sqrt(view.weight[rows])

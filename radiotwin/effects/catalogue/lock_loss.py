@@ -81,7 +81,10 @@ class _States:
 
 def _find_drops(view: ResidualView, receiver: int,
                 rows: np.ndarray) -> tuple[_States, np.ndarray] | None:
-    """Find random drops in the readings (rows) of a receiver, and each one's gain [nats]."""
+    """Find random drops in a receiver's readings (rows), and each one's log-likelihood gain [nats].
+
+    None if they are too weak, do not come and go, or are as frequent for other receivers.
+    """
     compared_db, _ = compared_where_possible_db(view)
     rest_db, instant = compared_db[rows], _instants(view.links, rows)
     states = max((_two_states(rest_db, instant, drop_db) for drop_db in FIRST_DROPS_DB),
@@ -104,7 +107,7 @@ def _find_drops(view: ResidualView, receiver: int,
 
 
 def _instants(links: Links, rows: np.ndarray) -> np.ndarray:
-    """Assign each link (n,) to an instant by flight and time; one without a time is separate."""
+    """Assign each link (n,) to an instant by flight and time; one without a time has its own."""
     time_s = links.time_s[rows]
     key = np.where(np.isfinite(time_s), time_s, rows)
     _, instant = np.unique(np.column_stack([links.flight[rows], key]), axis=0, return_inverse=True)
@@ -112,7 +115,7 @@ def _instants(links: Links, rows: np.ndarray) -> np.ndarray:
 
 
 def _two_states(rest_db: np.ndarray, instant: np.ndarray, drop_db: float) -> _States:
-    """Fit the mixture of two states by EM, starting from a drop [dB]."""
+    """Fit two states, normal and lower by a drop, by EM; all readings of an instant share one."""
     share, level_db = 0.2, float(np.quantile(rest_db, 0.6))
     scale_db = max(robust_sd(rest_db), 0.5) / 2
     low, total = np.zeros(instant.max() + 1), np.zeros(instant.max() + 1)
@@ -136,7 +139,7 @@ def _two_states(rest_db: np.ndarray, instant: np.ndarray, drop_db: float) -> _St
 
 
 def _single_state(rest_db: np.ndarray) -> np.ndarray:
-    """Fit one Student t with trial degrees of freedom; return its log-likelihoods (n,) [nats]."""
+    """Fit one Student t of the best trial degrees of freedom: log-likelihoods (n,) [nats]."""
     best = np.full(len(rest_db), -np.inf)
     for dof in TAILS:
         level_db = float(np.median(rest_db))
@@ -153,7 +156,7 @@ def _single_state(rest_db: np.ndarray) -> np.ndarray:
 
 def _comes_and_goes(links: Links, rows: np.ndarray, instant: np.ndarray,
                     low: np.ndarray) -> bool:
-    """Check whether the low instants (i,) form several separate periods, none of them dominant."""
+    """Check whether instants of low level (i,) form several separate periods, none dominant."""
     flight = np.zeros(len(low), dtype=int)
     flight[instant] = links.flight[rows]
     begins = low & ~np.r_[False, low[:-1] & (flight[1:] == flight[:-1])]
@@ -183,6 +186,7 @@ class LockLoss(DetectionEffect):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
+        """Propose the share of links that each receiver loses, or weakens, at random."""
         links, blank, shares, drops_db = view.links, {}, {}, {}
         # Behind buildings links are also blank, or weak, because there is no path.
         clear = links.los if links.los.any() else np.ones(len(links), dtype=bool)
@@ -202,6 +206,7 @@ class LockLoss(DetectionEffect):
 
     @override
     def losses(self, links: Links) -> Losses:
+        """Compute each link's (n,) probabilities of a blank and of a drop, and the drop [dB]."""
         blank, drop, drop_db = np.zeros((3, len(links.receiver_names)))
         for receiver, probability in self.params.receivers.items():
             (drop if receiver in self.params.drops_db else blank)[receiver] = probability
@@ -210,6 +215,7 @@ class LockLoss(DetectionEffect):
 
     @override
     def variation(self) -> Variation | None:
+        """Put loss probabilities (log odds) and drops [dB] into a search vector; too many: None."""
         if len(self.params.receivers) > MAX_VARIED:
             return None
         log_odds = logit(np.array(list(self.params.receivers.values())))
@@ -231,6 +237,7 @@ class LockLoss(DetectionEffect):
 
     @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
+        """Report each receiver's share of lost links, and its drop [dB], with 90 % intervals."""
         sd = estimate.params_sd
         if not len(sd):  # too many receivers to refine
             sd = np.full(len(self.params.receivers) + len(self.params.drops_db), np.nan)
@@ -247,14 +254,14 @@ class LockLoss(DetectionEffect):
 
 
 def _blank_share(view: ResidualView, rows: np.ndarray) -> float | None:
-    """Estimate the share of a receiver's links (rows) that are lost; None if the gain is low."""
+    """Estimate which share of a receiver's links (rows) is undetected at random; None: unsure."""
     links = view.links
     blank = np.isnan(links.level_db[rows])
     if not blank.any() or not np.isfinite(links.limit_db[rows]).all():
         return None
     margin = (links.limit_db[rows] - view.mean_db[rows]) / view.scale_db[rows]
     probability, nats = _likeliest(stdtr(DOF, margin), blank)
-    # The strongest links must gain, else its limit of detection is higher; and most devices, else
+    # If the strongest links do not gain, the limit of detection is higher; if most devices do not,
     # there is an obstacle.
     strong = margin <= np.quantile(margin, STRONGEST)
     gains = (nats.sum() > MIN_NATS * view.design_effect and nats[strong].sum() > 0
@@ -263,9 +270,9 @@ def _blank_share(view: ResidualView, rows: np.ndarray) -> float | None:
 
 
 def _likeliest(below: np.ndarray, blank: np.ndarray) -> tuple[float, np.ndarray]:
-    """Estimate the probability of a random blank, and the gain (n,) of each link by it [nats].
+    """Estimate the probability of random loss, and each link's log-likelihood gain (n,) [nats].
 
-    `below` (n,) is the probability that the level is below the limit.
+    `below` (n,) is the probability that the level is below the limit of detection.
     """
     below = np.maximum(below, MIN_PROBABILITY)
 

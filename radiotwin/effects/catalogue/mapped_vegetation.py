@@ -24,7 +24,7 @@ MIN_SPECIFIC_DB_M = 0.005  # 0.5 dB over 100 m; a lower value is no loss
 
 
 class MappedVegetation(GainEffect):
-    """Loss through the mapped vegetation of one kind; each step finds one kind."""
+    """Loss through the mapped vegetation of one kind; each search step finds one kind."""
 
     name = "mapped_vegetation"
     in_words = "vegetation of the map"
@@ -46,6 +46,7 @@ class MappedVegetation(GainEffect):
 
     @override
     def unavailable(self, links: Links) -> str | None:
+        """Return why mapped vegetation cannot be tested (none, or few links pass it); else None."""
         if missing := super().unavailable(links):
             return missing
         if not len(city_of(links, self.name).vegetation):
@@ -57,6 +58,7 @@ class MappedVegetation(GainEffect):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
+        """Propose trial attenuations [dB/m] of each kind of mapped vegetation."""
         known = view.found_params(self.name, "kind")
         most_db = max_loss_db(view.links.frequency_hz)
         return [self.Params(kind=kind, specific_attenuation_db_m=specific, greatest_loss_db=most_db)

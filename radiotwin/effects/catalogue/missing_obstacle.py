@@ -73,7 +73,7 @@ T = TypeVar("T")
 
 
 class MissingObstacle(GainEffect):
-    """A box that obstructs links; each step finds one."""
+    """A box that obstructs links; each search step finds one."""
 
     name = "missing_obstacle"
     in_words = "a building that the map lacks"
@@ -104,6 +104,7 @@ class MissingObstacle(GainEffect):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
+        """Propose boxes where links with line of sight lack power, at the best ground cells."""
         links = view.links
         rows = np.flatnonzero(links.los)
         if not len(rows):
@@ -122,10 +123,10 @@ class MissingObstacle(GainEffect):
 
     def _best_shape(self, view: ResidualView, los: np.ndarray, centre_m: np.ndarray,
                     height: int, by_class: bool) -> Params | None:
-        """Find the box near a cell's centre with the highest gain of links with sight (rows `los`).
+        """Find the box near a cell's centre that explains links with line of sight (`los`) best.
 
-        Shapes, turns, places and heights are tried in turn: a local search from a box that is too
-        large would not leave it. None if all boxes stand in buildings of the map.
+        Shapes, turns, places and heights are tried in turn: a local search from too large a box
+        would get stuck. None if all boxes overlap buildings of the map, or boxes found before.
         """
         links, (x_m, y_m) = view.links, centre_m.tolist()
         found = view.found_params(self.name, "box")
@@ -160,6 +161,7 @@ class MissingObstacle(GainEffect):
 
     @override
     def term(self, links: Links, level_at: LevelAt) -> Term:
+        """Return the change of levels by the box [dB]: by new paths, known paths or knife edges."""
         offset_db = np.zeros(len(links))
         if self.is_exact:
             city = city_of(links, self.name)
@@ -175,7 +177,7 @@ class MissingObstacle(GainEffect):
 
     def _offsets_db(self, links: Links, box: Box, scattered_db: tuple[float, ...],
                     by_class: bool, level_at: LevelAt) -> np.ndarray:
-        """Compute the gain (k, n) of links by a box for k scattered powers, by knife edges [dB]."""
+        """Compute by knife edges the gain (k, n) by a box, for k powers in its shadow [dB]."""
         offset_db, rows = np.zeros((len(scattered_db), len(links))), np.flatnonzero(links.los)
         crossing = cross(box, *ends_above(links, box[:2], rows))
         crosses = np.isfinite(crossing.left_m)
@@ -190,7 +192,7 @@ class MissingObstacle(GainEffect):
         return offset_db
 
     def _known_paths_db(self, links: Links, box: Box, level_at: LevelAt) -> np.ndarray:
-        """Compute the gain (n,) of links by a box that obstructs some of their known paths [dB]."""
+        """Compute the gain (n,), at most 0, by a box that blocks paths followed without it [dB]."""
         from radiotwin.propagation.laws.followed_paths import KnownPaths, UprightBox
 
         city, rows = city_of(links, self.name), np.flatnonzero(self._near(links, box))
@@ -226,7 +228,10 @@ class MissingObstacle(GainEffect):
         return None if self.levels == "quick" else self._near(links, self.params.box)
 
     def _shadow_db(self, links: Links, level_at: LevelAt, by_class: bool) -> np.ndarray:
-        """Compute the gain (n,), below 0, of links in a full shadow, see `Params.by_class` [dB]."""
+        """Compute the change of level (n,) from losing the line of sight [dB]; cached.
+
+        `by_class`: by the channel's law without sight, else by what other paths leave.
+        """
         def shadow_db() -> np.ndarray:
             hidden = links.with_los(np.zeros(len(links), bool))
             return level_at(hidden, not by_class) - level_at(links, not by_class)
@@ -240,10 +245,11 @@ class MissingObstacle(GainEffect):
 
     @override
     def variation(self) -> Variation:
+        """Put the box, and with knife edges also its shadow's power, into a search vector."""
         params = self.params
         x_m, y_m = params.box[:2]
-        # Known paths are nearly as good as following them for each value, which takes minutes. They
-        # contain the scattered power, so that is not searched.
+        # Paths followed once are nearly as good as paths followed for each trial value, which takes
+        # minutes. They contain the scattered power, so the search leaves that power out.
         along_paths = self.levels != "quick"
         varied = self.with_params(params, "known_paths" if along_paths else "quick")
         count = len(params.box) + (not along_paths)
@@ -268,6 +274,7 @@ class MissingObstacle(GainEffect):
 
     @override
     def contradicted(self, links: Links) -> str | None:
+        """Return why no building can be there, or nothing tells how far away it is; else None."""
         through = devices_through(self.params.box, links)
         if is_beside_unknown(through, links):
             return BESIDE_UNKNOWN
@@ -302,6 +309,7 @@ class MissingObstacle(GainEffect):
 
     @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
+        """Report the box [m, deg] and the power in its shadow [dB], with 90 % intervals."""
         variation = self.variation()
         reach = variation.values + QUANTILE_90 * estimate.sides_sd * np.array([[-1.0], [1.0]])
         units = {"turn_deg": "deg", "scattered_db": "dB"}
@@ -317,13 +325,13 @@ class MissingObstacle(GainEffect):
 
 
 def _shadow_options(links: Links, options: tuple[T, ...]) -> tuple[T, ...]:
-    """Return all options of the power in a shadow; without a map, without scattering, one."""
+    """Return the trial powers in a shadow; the first one only if no map tells the power there."""
     return options if links.city is not None else options[:1]
 
 
 def _gain_db(crossing: Crossing, scattered: np.ndarray | float,
              wavelength_m: float) -> np.ndarray:
-    """Compute the gain of n links that cross a box, from 0 down to -`MAX_LOSS_DB` [dB].
+    """Compute by knife edges the gain of n links that cross a box, 0 to -`MAX_LOSS_DB` [dB].
 
     `scattered` is the power in the shadow relative to the link without the box, (n,) or (k, n).
     """
@@ -341,7 +349,7 @@ def _gain_db(crossing: Crossing, scattered: np.ndarray | float,
 
 
 def built_share(links: Links, box: Box, found: Iterable[Box] = ()) -> float:
-    """Compute the share of a box's footprint and margin that is built, on the map or by `found`."""
+    """Compute the share of a box's footprint and margin covered by buildings or boxes `found`."""
     x_m, y_m = grid_around(box, AROUND_M, GRID)
     built = np.zeros(x_m.shape, dtype=bool)
     if links.city is not None:

@@ -59,6 +59,7 @@ class NoiseFloor(ReceiverEffect):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
+        """Propose noise floors of receivers [dB], among quantiles of their readings."""
         links, found, sure, highest = view.links, {}, {}, {}
         seen = np.isfinite(links.level_db)
         for receiver in frequent_labels(links.receiver[seen], MIN_LINKS):
@@ -83,8 +84,8 @@ class NoiseFloor(ReceiverEffect):
         tried = [{receiver: min(highest[receiver], float(np.nanquantile(
             links.level_db[links.receiver == receiver], share))) for receiver in found}
             for share in COMMON_QUANTILES]
-        # If links are blank below a limit, a floor above it is wrong for most receivers, but single
-        # ones may have one.
+        # If links are blank below a limit of detection, most receivers cannot have a noise floor
+        # above that limit, but a few may.
         single = sure and sure.keys() != found.keys()
         return [*([self.Params(receivers=sure, highest=highest, alone=True)] if single else []),
                 *(self.Params(receivers=floors_db, highest=highest)
@@ -92,6 +93,7 @@ class NoiseFloor(ReceiverEffect):
 
     @override
     def inputs(self, links: Links) -> np.ndarray:
+        """Return the noise power (n,) of each link's receiver, linear; 0 if it has no floor."""
         floors_db = list(self.params.receivers.values())
         # A receiver without an estimate has the median floor, unless only single ones have a floor.
         usual = len(floors_db) >= MIN_RECEIVERS and not self.params.alone
@@ -106,6 +108,7 @@ class NoiseFloor(ReceiverEffect):
 
     @override
     def variation(self) -> Variation:
+        """Put the receivers' floors [dB] into a search vector, each searched by itself."""
         params = self.params
         n = len(params.receivers)
         return Variation(
@@ -116,6 +119,7 @@ class NoiseFloor(ReceiverEffect):
 
     @override
     def implausible(self, coefficients: np.ndarray) -> str | None:
+        """Return a sentence if most floors are at the highest that readings allow; else None."""
         at_bound = [floor_db > self.params.highest.get(receiver, np.inf) - AT_BOUND_DB
                     for receiver, floor_db in self.params.receivers.items()]
         if 2 * sum(at_bound) <= len(at_bound):

@@ -43,6 +43,7 @@ class _Paths(PathEffect):
 
     @override
     def unavailable(self, links: Links) -> str | None:
+        """Return why paths cannot be followed (no map, or too many links); else None."""
         if missing := super().unavailable(links):
             return missing
         if len(links) > MAX_LINKS:
@@ -51,6 +52,7 @@ class _Paths(PathEffect):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
+        """Propose strengths near theory [dB]; levels are calibrated on links with line of sight."""
         links = view.links
         wavelength_m = speed_of_light / links.frequency_hz
         direct_db = 20 * np.log10(wavelength_m / (4 * np.pi * links.distance_m))
@@ -72,6 +74,7 @@ class _Paths(PathEffect):
 
     @override
     def variation(self) -> Variation:
+        """Return the strength of the paths [dB] for the search, within bounds about theory."""
         level_db = self.params.level_db
         return Variation(
             np.array([self.params.strength_db]), np.array([2.0]), np.array([level_db - BELOW_DB]),

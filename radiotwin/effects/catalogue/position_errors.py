@@ -54,6 +54,7 @@ class _PositionError(MovedEnd):
 
     @override
     def implausible(self, coefficients: np.ndarray) -> str | None:
+        """Return a sentence if the move is within the accuracy of surveys and maps; else None."""
         size_m = float(np.linalg.norm(self.params.move_m))
         if size_m < MIN_MOVE_M:
             return (f"it would be {size_m:.1f} m from its given position only; surveys and the "
@@ -63,6 +64,7 @@ class _PositionError(MovedEnd):
 
     @override
     def variation(self) -> Variation:
+        """Return the move along each axis [m] for the search."""
         axes, most_m = len(self.params.move_m), self.max_move_m
         return Variation(
             np.array(self.params.move_m), np.full(axes, self.step_m), np.full(axes, -most_m),
@@ -71,7 +73,7 @@ class _PositionError(MovedEnd):
 
 
 class DevicePositionError(_PositionError):
-    """Wrong position of an anchor and all devices on its mast; each step finds the worst."""
+    """Wrong position of an anchor and all devices on its mast; each search step finds the worst."""
 
     name = "device_position_error"
     in_words = "a wrong position of the device"
@@ -93,6 +95,7 @@ class DevicePositionError(_PositionError):
 
     @override
     def unavailable(self, links: Links) -> str | None:
+        """Return why no device can be moved (none of known position, or too many); else None."""
         devices = _movable_anchors(links)
         if not devices:
             return f"no anchor has {MIN_LINKS} links"
@@ -102,6 +105,7 @@ class DevicePositionError(_PositionError):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
+        """Propose the move of the mast whose links gain most from it; empty if they gain little."""
         links = view.links
         known = {other for device in view.found_params(self.name, "device")
                  for other in site_of(links, device)}
@@ -134,6 +138,7 @@ class DevicePositionError(_PositionError):
 
     @override
     def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:
+        """Yield the level change per metre that a device is moved north, for several devices."""
         for mask in members(view.links.device):
             device = int(view.links.device[mask][0])
             if device in view.links.anchors:
@@ -148,6 +153,7 @@ class DevicePositionError(_PositionError):
 
     @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
+        """Report the corrected x and y of each device on the mast [m]."""
         declared_m = links.device_m[self.params.device, :2]
         return {f"{axis}_m[{links.device_names[device]}]": Parameter.normal(
                     old_m + move_m, sd, "m", Allowed(old_m - MAX_MOVE_M, old_m + MAX_MOVE_M))
@@ -185,6 +191,7 @@ class DeviceMoved(_PositionError):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
+        """Propose which device moved, where to and on which flights, among links that stand out."""
         links = view.links
         if view.group is None:
             return []
@@ -198,7 +205,7 @@ class DeviceMoved(_PositionError):
         return [self.params] if len(self.rows(view.links)) else []
 
     def _best_move_in_time(self, view: ResidualView, device: int) -> tuple[float, Params]:
-        """Find the move of a device, from one flight on or up to one, with the best gain [nats]."""
+        """Find the likeliest move on a device's first or last flights; its gain [nats] first."""
         links = view.links
         device_rows = np.flatnonzero(links.device == device)
         rows = subsample(device_rows, MAX_PROPOSE_LINKS)
@@ -243,6 +250,7 @@ class DeviceMoved(_PositionError):
 
     @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
+        """Report x and y of the device on the flights when it was elsewhere [m]."""
         given_m, flights = links.device_m[self.params.device, :2], self.params.flights
         name = links.device_names[self.params.device]
         when = flights[0] if len(flights) == 1 else f"{flights[0]} to {flights[-1]}"
@@ -253,7 +261,7 @@ class DeviceMoved(_PositionError):
 
 
 class ReceiverPositionError(_PositionError):
-    """Constant error of all positions of one receiver; each step finds the worst receiver."""
+    """Constant error of all positions of one receiver; each search step finds the worst one."""
 
     name = "receiver_position_error"
     in_words = "a wrong position of the receiver"
@@ -284,6 +292,7 @@ class ReceiverPositionError(_PositionError):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
+        """Propose the shift of one receiver's positions whose links gain most from it."""
         moves = [sign * size_m * np.array(axis) for axis in RECEIVER_AXES
                  for size_m in RECEIVER_MOVES_M for sign in (-1, 1)]
         known = set(view.found_params(self.name, "receiver"))
@@ -300,6 +309,7 @@ class ReceiverPositionError(_PositionError):
 
     @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
+        """Report the receiver's true minus given x, y and z [m]."""
         params = self.params
         name = links.receiver_names[params.receiver]
         return {f"true_minus_given_{axis}_m[{name}]": Parameter.normal(

@@ -61,6 +61,7 @@ class ReceiverSaturation(ReceiverEffect):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
+        """Propose a compression for each receiver whose strongest readings clearly lack power."""
         links, found = view.links, {}
         seen = np.isfinite(links.level_db)
         for receiver in frequent_labels(links.receiver[seen], MIN_LINKS):
@@ -98,6 +99,7 @@ class ReceiverSaturation(ReceiverEffect):
 
     @override
     def variation(self) -> Variation:
+        """Put each receiver's saturation level [dB] and log smoothness into a search vector."""
         n = len(self.params.receivers)
         values = np.concatenate([[level_db, np.log(smoothness)]
                                  for level_db, smoothness in self.params.receivers.values()])
@@ -114,6 +116,7 @@ class ReceiverSaturation(ReceiverEffect):
 
     @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
+        """Report the level at which each receiver saturates, with a 90 % interval."""
         unit = links.level_unit
         return {f"saturation_level[{links.receiver_names[receiver]}]":
                 Parameter.normal(compression.level_db, sd_db, unit)

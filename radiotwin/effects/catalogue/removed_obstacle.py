@@ -41,7 +41,7 @@ NEAR_M = 25.0  # links whose ground tracks are farther away keep their level, al
 
 
 class RemovedObstacle(GainEffect):
-    """One building removed from the map; each step finds one."""
+    """One building removed from the map; each search step finds one."""
 
     name = "removed_obstacle"
     in_words = "a building that is gone"
@@ -65,6 +65,7 @@ class RemovedObstacle(GainEffect):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
+        """Propose the building whose removal explains its links far better than a lower roof."""
         links = view.links
         assert links.city is not None
         rows = np.flatnonzero(~links.los)
@@ -91,6 +92,7 @@ class RemovedObstacle(GainEffect):
 
     @override
     def term(self, links: Links, level_at: LevelAt) -> Term:
+        """Return the change of levels near the building if the map does not have it [dB]."""
         offset_db, with_it = np.zeros(len(links)), city_of(links, self.name)
         city, box = _without(with_it, self.params.building)
         rows = _near(links, box)
@@ -104,13 +106,14 @@ class RemovedObstacle(GainEffect):
 
     @override
     def corrected_map(self, city: CityMap) -> CityMap:
-        # By its position: buildings removed or added by other effects have changed the indices.
+        # Found by position, as other effects that remove or add buildings change the indices.
         apart_m = np.linalg.norm(buildings(city)[1] - np.array(self.params.centre_m), axis=1)
         nearest = int(apart_m.argmin())
         return _without(city, nearest)[0] if apart_m[nearest] < SAME_M else city
 
     @override
     def mark(self, links: Links) -> Mark | None:
+        """Return the building's faces to draw on maps; None without a map."""
         city = links.city
         if city is None:
             return None
@@ -120,7 +123,7 @@ class RemovedObstacle(GainEffect):
 
     @override
     def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:
-        # One building that hides a median number of links, as following paths is expensive.
+        """Yield the rise without one building of median shadow (paths are slow), 1 dB behind it."""
         links = view.links
         assert links.city is not None
         blocker, (_, centres_m) = only_blocker(links), buildings(links.city)
@@ -149,7 +152,7 @@ class RemovedObstacle(GainEffect):
 
 
 def _gain_nats(view: ResidualView, building: int, other: CityMap) -> float:
-    """Compute the log-likelihood gain by another map, which differs in one building [nats]."""
+    """Compute the log-likelihood gain if a map that differs in one building were right [nats]."""
     assert view.links.city is not None
     rows = _near(view.links, _without(view.links.city, building)[1])
     near_links = view.links.select(rows)
@@ -179,7 +182,7 @@ def only_blocker(links: Links) -> np.ndarray:
 
 @lru_cache(maxsize=32)
 def _lower(city: CityMap, building: int, by_m: float) -> CityMap:
-    """Lower a building of a map, at most to `FLAT_M` above its base."""
+    """Lower a building of a map, but not below `FLAT_M` above its base."""
     corners = np.unique(city.faces[buildings(city)[0] == building])
     vertices = city.vertices.copy()
     z_m = vertices[corners, 2]

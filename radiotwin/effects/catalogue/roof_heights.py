@@ -94,7 +94,7 @@ class RoofCrossings(NamedTuple):
 
 def roof_crossings(city: CityMap, a_m: np.ndarray, b_m: np.ndarray,
                    which: np.ndarray | None = None) -> RoofCrossings:
-    """Find where links cross buildings, except those at their ends.
+    """Find where links cross buildings, except a building at one of the link's ends.
 
     Args:
         city: 3D map.
@@ -132,7 +132,7 @@ def roof_crossings(city: CityMap, a_m: np.ndarray, b_m: np.ndarray,
 
 
 def _roof_over_m(city: CityMap, points_m: np.ndarray, of_building: np.ndarray) -> np.ndarray:
-    """Compute the height (n,) of a building's roof (faces (f,)) above points; NaN beside it [m]."""
+    """Compute how far (n,) a building's roof is above points [m]; NaN where there is no roof."""
     top_m = float(city.vertices[:, 2].max()) + 1.0
     above_m = np.column_stack([points_m[:, :2], np.full(len(points_m), top_m)])
     distance_m, face, _ = city.first_hits_towards(above_m, DOWN)
@@ -141,7 +141,7 @@ def _roof_over_m(city: CityMap, points_m: np.ndarray, of_building: np.ndarray) -
 
 @lru_cache(maxsize=4)
 def _boxes(city: CityMap) -> dict[int, Box]:
-    """Return building -> box of height `BOTTOMLESS_M` around it; without the ground."""
+    """Return building -> box around it, so high that links above it cross it; not the ground."""
     label = buildings(city)[0]
     low_m, high_m = building_extents_m(city, label)
     middle_m, size_m = 0.5 * (low_m + high_m), high_m - low_m
@@ -178,6 +178,7 @@ class RoofHeights(GainEffect):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
+        """Propose true minus mapped heights of the roofs that links determine."""
         rows = subsample(np.arange(len(view.links)), MAX_LINKS)
         contrast_db = _contrast_db(view.links.select(rows), view.level_at)
         if np.median(contrast_db) < LEAST_CONTRAST_DB:
@@ -187,6 +188,7 @@ class RoofHeights(GainEffect):
 
     @override
     def term(self, links: Links, level_at: LevelAt) -> Term:
+        """Return the change of levels [dB] if roofs have their estimated heights."""
         city, offset_db = city_of(links, self.name), np.zeros(len(links))
         count = len(buildings(city)[1])
         raised_m = np.zeros(count)
@@ -232,10 +234,10 @@ def surely_off(roofs: Sequence[Roof]) -> list[Roof]:
 
 
 def with_model_error(roofs: Sequence[Roof]) -> tuple[Roof, ...]:
-    """Estimate the model error of each roof from all others, leave-one-out, and add it.
+    """Add the error of the model to each roof's uncertainty, estimated from all other roofs.
 
     Sets `common_m` to the common offset of the others, and adds their scatter and the uncertainty
-    of that offset to `offset_sd_m`.
+    of that offset to `offset_sd_m`, in copies.
 
     Args:
         roofs: n roofs with the standard deviations from their own links.
@@ -282,7 +284,7 @@ class _Search:
         self._slope = np.abs(step_m[:, 2]) / np.maximum(np.hypot(*step_m[:, :2].T), 1.0)
 
     def _most_db(self, loss_db: np.ndarray) -> np.ndarray:
-        """Compute the greatest loss (r,) of each link over its roofs, from losses (m,) [dB]."""
+        """Compute the greatest loss (r,) on each link, from the losses of its roofs (m,) [dB]."""
         most_db = self._hidden_db.copy()
         if len(loss_db):
             link = self._crossings.link
@@ -292,7 +294,7 @@ class _Search:
         return most_db
 
     def roofs(self) -> tuple[Roof, ...]:
-        """Estimate all roofs with enough links, in several sweeps, model error included."""
+        """Estimate roofs' height errors, each with the others fixed; without small, unsure ones."""
         label, centres_m = buildings(self._city)
         priors_m = building_height_sds_m(self._city)
         tall_m = centres_m[:, 2] - building_extents_m(self._city, label)[0][:, 2]
@@ -313,7 +315,7 @@ class _Search:
 
     def _estimate(self, crossings: np.ndarray, tall_m: float,
                   prior_sd_m: float) -> tuple[float, float]:
-        """Estimate a roof's offset from its crossings (q,): mean and sd [m]; 0 if undetermined."""
+        """Estimate a roof's true minus mapped height and its sd [m]; 0 if its links cannot tell."""
         offsets_m = prior_sd_m * OFFSETS
         offsets_m = offsets_m[offsets_m > (LEAST_SHARE - 1) * tall_m]
         link = self._crossings.link[crossings]
@@ -329,7 +331,7 @@ class _Search:
         rows = self._rows[link[informative]]
         log = np.array([self._view.gain_nats(rows, change_db).sum() for change_db in changes_db])
         log -= 0.5 * (offsets_m / prior_sd_m) ** 2
-        if log.argmax() == 0:  # lowest: it may not exist, which `removed_obstacle` decides
+        if log.argmax() == 0:  # lowest trial: gone? `removed_obstacle` decides
             return 0.0, prior_sd_m
         share = np.exp(log - log.max())
         share /= share.sum()
@@ -357,5 +359,5 @@ def _contrast_db(links: Links, level_at: LevelAt) -> np.ndarray:
 
 
 def _level_db(loss_db: np.ndarray, contrast_db: np.ndarray) -> np.ndarray:
-    """Add the powers over the roofs and of other paths, `contrast_db` below line of sight [dB]."""
+    """Add the power over roofs, `loss_db` below line of sight, to that of other paths [dB]."""
     return 10 * np.log10(10 ** (-loss_db / 10) + 10 ** (-contrast_db / 10))

@@ -30,7 +30,7 @@ TYPICAL_WIDTH_DEG = 65.0  # 3GPP TR 38.901, Table 7.3-1
 
 
 class SectorAntenna(SectorEffect):
-    """An undeclared sector antenna; each step finds that of one device, or all of a mast."""
+    """An undeclared sector antenna; each search step finds that of one device, or all of a mast."""
 
     settled_by = "fly around the device at one distance and one height"
     variant = "sector antenna of a device"
@@ -39,6 +39,7 @@ class SectorAntenna(SectorEffect):
 
     @override
     def propose(self, view: ResidualView) -> list[SectorEffect.Params]:
+        """Propose a sector antenna for the device that gains most, and for all on its mast."""
         known = {device for devices in view.found_params(self.name, "devices")
                  for device in devices}
         devices = sorted((set(eligible_devices(view.links)) - known)
@@ -46,7 +47,7 @@ class SectorAntenna(SectorEffect):
         patterns = {straight: _best_patterns(view, devices, straight)
                     for straight in ([False, True] if view.links.city is not None else [False])}
         straight = max(patterns, key=lambda key: max((nats for _, nats in patterns[key].values()),
-                                                     default=0.0))  # the first of equal ones
+                                                     default=0.0))  # if equal, the first
         found = patterns[straight]
         if not found:
             return []
@@ -63,6 +64,7 @@ class SectorAntenna(SectorEffect):
 
     @override
     def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:
+        """Yield a loss of 1 dB behind the sector antenna of one device, for several devices."""
         links, size = view.links, quantities(SectorPattern)["front_to_back_db"]
         for mask in members(links.device):
             off = _signed_deg(links.azimuth_deg - median_azimuth_deg(links.azimuth_deg[mask]))
@@ -73,6 +75,7 @@ class SectorAntenna(SectorEffect):
 
     @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
+        """Report each device's antenna pattern and gain [dB], with 90 % intervals."""
         reported: dict[str, Parameter] = {}
         patterns_sd = np.reshape(estimate.params_sd, (len(self.params.devices), -1))
         for number, (device, pattern) in enumerate(self.params.devices.items()):
@@ -113,7 +116,7 @@ def _best_patterns(view: ResidualView, devices: list[int],
 
 def _best_pattern(view: ResidualView, rows: np.ndarray,
                   straight: bool) -> tuple[SectorPattern, float]:
-    """Find the pattern of a grid that fits links best, and its gain over a constant [nats]."""
+    """Find the trial pattern that fits links best, and its gain over a constant level [nats]."""
     rays, residual_db = Departures.of(view.links, rows, straight), view.residual_db[rows]
     weight = view.weight[rows] * np.isfinite(view.links.level_db[rows])
 

@@ -76,6 +76,7 @@ class TiltedDipole(BodyFrameEffect):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
+        """Propose the tilt of each receiver's dipole, where one fits its residuals clearly."""
         links, found = view.links, {}
         usable = links.los & np.isfinite(links.heading_deg)
         for receiver in frequent_labels(links.receiver, MIN_LINKS):
@@ -87,6 +88,7 @@ class TiltedDipole(BodyFrameEffect):
 
     @override
     def gain_db(self, links: Links) -> np.ndarray:
+        """Compute the gain (n,) of the receivers' tilted dipoles on each link [dB]."""
         offset_db = np.zeros(len(links))
         for receiver, dipole in self.params.receivers.items():
             rows = np.flatnonzero((links.receiver == receiver) & np.isfinite(links.heading_deg))
@@ -102,7 +104,7 @@ class TiltedDipole(BodyFrameEffect):
 
 
 def _best_dipole(view: ResidualView, rows: np.ndarray) -> DipoleParams | None:
-    """Find the dipole of a grid that fits best along straight lines; None if the gain is low."""
+    """Find the trial tilt of a dipole that fits best on straight lines; None if it gains little."""
     links = view.links.select(rows)
     length_m = np.linalg.norm(links.offset_m, axis=1, keepdims=True)
     ray = -(links.offset_m / np.maximum(length_m, 1e-9))
@@ -137,7 +139,7 @@ class _Arrivals(NamedTuple):
         return cls(Rays.of(links, of_device=False), links.receiver_axes)
 
     def offset_db(self, dipole: DipoleParams) -> np.ndarray:
-        """Compute the gain (n,) of each link by the dipole [dB]."""
+        """Compute each link's gain (n,) by a dipole instead of an isotropic antenna [dB]."""
         axis = _axis(self.axes, dipole.tilt_deg, dipole.lean_azimuth_deg)
         gain = dipole_gain(self.rays.direction,
                            axis.astype(self.rays.direction.dtype)[self.rays.link])

@@ -50,6 +50,7 @@ class UncertainSight(GainEffect):
 
     @override
     def unavailable(self, links: Links) -> str | None:
+        """Return why doubtful lines of sight cannot be tested (no map, or too few); else None."""
         if missing := super().unavailable(links):
             return missing
         chance = self._chance(links)
@@ -65,6 +66,7 @@ class UncertainSight(GainEffect):
 
     @override
     def term(self, links: Links, level_at: LevelAt) -> Term:
+        """Return fitted loss in sight, and gain out of it, times the chance of a wrong map."""
         params = self.params
         chance, los = self._chance(links), links.los
         columns = np.column_stack([np.where(los, chance - 1.0, 0.0), np.where(los, 0.0, chance)])
@@ -73,6 +75,7 @@ class UncertainSight(GainEffect):
 
     @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
+        """Report contrast, loss without sight and gain with sight, each in dB."""
         contrast = Parameter.normal(self.params.contrast_db, estimate.params_sd[0], "dB",
                                     Allowed(low=0.0))
         names = "loss_without_sight_db", "gain_with_sight_db"
@@ -81,7 +84,7 @@ class UncertainSight(GainEffect):
             zip(names, estimate.coefficients, estimate.coefficients_sd, strict=True)}
 
     def _chance(self, links: Links) -> np.ndarray:
-        """Compute the probability (n,) of line of sight of each link; cached."""
+        """Compute the share (n,) of randomly altered maps with line of sight on a link; cached."""
         def share_of_maps() -> np.ndarray:
             city = city_of(links, self.name)
             seen = links.los.astype(float)

@@ -69,6 +69,7 @@ class UnexplainedTrend(GainEffect):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
+        """Propose one curve over a variable, or one per receiver, whichever rates higher."""
         value = self._value(view.links, view.level_at)
         known = np.isfinite(value)
         if known.mean() < MIN_KNOWN or np.ptp(value[known]) < 1e-9:
@@ -90,6 +91,7 @@ class UnexplainedTrend(GainEffect):
 
     @override
     def term(self, links: Links, level_at: LevelAt) -> Term:
+        """Return the columns of a piecewise linear curve, or of one per receiver [dB]."""
         basis = curve_basis(self._value(links, level_at), np.array(self.params.knots),
                       self.variable in CIRCULAR)
         columns = [basis if member is None else basis * (links.receiver == member)[:, None]
@@ -98,6 +100,7 @@ class UnexplainedTrend(GainEffect):
 
     @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
+        """Report the greatest minus the least value of each fitted curve [dB]."""
         curves = np.reshape(estimate.coefficients, (len(self.params.receivers), -1))
         result = {}
         for member, curve in zip(self.params.receivers, curves):
