@@ -252,7 +252,7 @@ class Effect(ABC):
 
     @abstractmethod
     def term(self, links: Links, level_at: LevelAt) -> Term:
-        """Compute the contribution of the effect to the mean level of n links.
+        """Compute what the effect (e.g. a wrong map, an antenna) changes in the level of n links.
 
         Args:
             links: n links.

@@ -72,7 +72,7 @@ class Curves:
         return np.where(self.judged, self.sd(0.5), np.nan)
 
     def fitted(self, curve: int, part: str) -> np.ndarray:
-        """Shrink the levels (k,) of all bins in one part of the data towards 0 by their errors.
+        """Shrink each bin's level (k,) in a part of the data towards 0, more if its error is large.
 
         Args:
             curve: index of the curve whose standard deviation sets the shrinkage.
