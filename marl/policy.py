@@ -313,7 +313,8 @@ def demonstrations(missions: list[Mission], iterations: int, rng: np.random.Gene
         rng: generator for plans and shadowing.
 
     Returns:
-        The features of `Seen` of all UAVs in all slots, and (N,) the moves that they took.
+        The fields of `Seen`, each with a row for every UAV and slot in which it still flew, in all
+        missions (N rows), and (N,) the move that it then took.
     """
     uavs, devices = (max(sizes) for sizes in zip(*((m.uavs, m.devices) for m in missions)))
     slots = max(mission.longest for mission in missions)

@@ -245,7 +245,7 @@ class BeliefPlanner(Learner):
 
 
 def weighted(belief: Belief, data_units: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Weight data by the probability that each device transmits, for planning.
+    """Multiply the data of each device by the probability that it transmits, for planning.
 
     Args:
         belief: belief of the map and of silent devices.

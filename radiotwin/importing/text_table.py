@@ -236,7 +236,7 @@ def _split(text: str) -> list[str]:
 
 
 def _fields(line: str, delimiter: str) -> list[str]:
-    """Split a line into fields; empty if a quotation mark is not closed."""
+    """Split a line into fields; return no field if Python's csv module refuses the line."""
     line, delimiter = _with_tabs(line, delimiter), "\t" if delimiter in BLANKS else delimiter
     try:
         return next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])

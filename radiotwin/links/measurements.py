@@ -404,10 +404,10 @@ def read_measurements(path: Path | str, devices_path: Path | str | None = None) 
 
 
 def read_devices(path: Path | str) -> pd.DataFrame:
-    """Read a table of devices, one row each, with the columns of `DEVICE_REQUIRED`.
+    """Read a table of devices, one row each, into a table with the columns of `DEVICE_REQUIRED`.
 
-    Its columns may have other names, and positions may be latitudes and longitudes where a
-    `frame.toml` beside it declares the frame; see `radiotwin.links.site_table`.
+    The file may use other column names (see `radiotwin.links.site_table`), and latitudes and
+    longitudes in place of x and y if a `frame.toml` beside it declares the local frame.
 
     Raises:
         BadInput: names file, row and column of the first value that cannot be used.

@@ -292,9 +292,10 @@ def _field(label: str, quantity: str, level_db: np.ndarray, kind: str, unit: str
 
 
 def _error_db(radio_map: RadioMap, truth: RadioMap, step: int) -> np.ndarray:
-    """Return model minus truth [dB] (device, z, y, x), at every `step`-th position in x and y.
+    """Subtract true gains from a model's [dB] (device, z, y, x); NaN for devices not in `truth`.
 
-    `radio_map` has those positions alone. NaN for devices that the truth lacks.
+    `radio_map` was thinned to every `step`-th position in x and y; `truth` is thinned here. A model
+    with `sigma_db` is compared by its mean over detected levels: a truth without it has no others.
     """
     error_db = np.full(radio_map.gain_db.shape, np.nan)
     model_db, true_db = comparable_db(radio_map, truth), truth.gain_db[..., ::step, ::step]

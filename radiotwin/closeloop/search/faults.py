@@ -119,10 +119,11 @@ def add_faults(state: SearchState, inputs: SearchInputs) -> SearchState:
 
 def _refuse_lasting(faults: list[Candidate | Trial], state: SearchState,
                     inputs: SearchInputs) -> list[Candidate | Trial]:
-    """Replace faults by refused trials if a lasting effect on the same links explains as much.
+    """Refuse faults of single flights if a lasting effect fits the same links as well or better.
 
     A receiver that changed for good also looks faulty in each window of time afterwards. Only
-    effects that the faults name as `confused_with` are fitted as rivals.
+    effects that the faults name as `confused_with` are fitted as rivals. A rival that gains at
+    least as many nats on the training links wins, and the fault becomes a refused `Trial`.
     """
     rivals = {name for each in faults if isinstance(each, Candidate)
               for name in each.effect.confused_with}

@@ -68,7 +68,7 @@ def write_numpy(radio_map: RadioMap, scene: Scene, path: Path) -> None:
     """Write NumPy arrays that `numpy.load` reads without pickle; the scene is not used.
 
     Arrays: gain_db, los and sigma_db (device, z, y, x), device, z_m, y_m, x_m; and ground_m (y, x)
-    where z_m is above the ground.
+    if z_m are heights above the ground.
     """
     lattice, dataset = radio_map.lattice, radio_map.dataset
     arrays = {"device": np.array(radio_map.devices), "z_m": lattice.z_m, "y_m": lattice.y_m,

@@ -178,8 +178,8 @@ def shortest(one: np.ndarray, other: np.ndarray, from_m: np.ndarray, to_m: np.nd
         to_m: (3,) end of the path [m].
 
     Returns:
-        Positions along the edges from their starts [m]; -1 if the path passes the intersection of
-        the edges.
+        Positions along the edges from their starts [m]; (-1, -1) if no path is found: it passes the
+        intersection of the edges, an end lies on an edge, or the iteration does not converge.
     """
     a, b = one[ALONG:ALONG + 3], other[ALONG:ALONG + 3]
     apart = other[START:START + 3] - one[START:START + 3]
