@@ -114,7 +114,7 @@ def run_algorithm(run: RunSettings, learner_settings: LearnerSettings, scene: Sc
             mission = campaign.mission()
             if on_learned is not None:
                 on_learned(campaign, mission)
-            campaign.tell(learner)
+            campaign.pass_uncertainty(learner)
             blocks += [{"round": number + 1} | block
                        for block in learner.prepare(mission, on_progress)]
             campaign.log(learner, mission, rng, (number + 1) * run.episodes * learner.replicas)
@@ -148,7 +148,7 @@ def resumed(campaign: "Campaign", learner: Learner, path: Path) -> list[dict]:
         learner.load_state(state["strategy"])
         blocks = require_log(state["blocks"], ("round", "episodes"))
     if not state["strategy"]:  # a learner without a state of its own is prepared from the twin
-        campaign.tell(learner)
+        campaign.pass_uncertainty(learner)
         learner.prepare(campaign.mission(), lambda _: None)
     return blocks
 
@@ -199,7 +199,7 @@ class Campaign:
             return self.in_truth()
         return twin_mission(self.scene, self.run, self.twin, self.known)
 
-    def tell(self, learner: Learner) -> None:
+    def pass_uncertainty(self, learner: Learner) -> None:
         """Pass the twin's uncertainty to a learner that uses it (`Learner.believes`)."""
         if not learner.believes:
             return

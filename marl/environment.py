@@ -212,15 +212,15 @@ def rate(snr_db: float, rate_scale: float) -> float:
 
 
 @njit(cache=True, nogil=True)
-def assign(strength: np.ndarray, max_rate: bool, out: np.ndarray) -> None:
+def assign(strength: np.ndarray, max_rate: bool, assigned: np.ndarray) -> None:
     """Assign at most one device to each UAV, and one UAV to each device (paper, Eq. 7 and 8).
 
     Args:
         strength: (U, K) strength of each link, -inf = not usable; overwritten.
         max_rate: whether a UAV that loses its best device gets none, not its next best.
-        out: (U,) device or -1, overwritten.
+        assigned: (U,) device or -1, overwritten.
     """
-    out[:] = -1
+    assigned[:] = -1
     for first in range(len(strength)):
         # Deferred acceptance: a UAV that loses a device proposes to the next one. As both sides
         # prefer the stronger link, the result is the greedy matching by strongest pair.
@@ -230,16 +230,16 @@ def assign(strength: np.ndarray, max_rate: bool, out: np.ndarray) -> None:
             if strength[u, k] == -np.inf:
                 break
             loser = -1
-            for v in range(len(out)):
-                if out[v] == k:
+            for v in range(len(assigned)):
+                if assigned[v] == k:
                     stronger = strength[u, k] > strength[v, k]
                     loser = v if stronger or (strength[u, k] == strength[v, k] and u < v) else u
             if loser != u:
-                out[u] = k
+                assigned[u] = k
             if loser >= 0:
                 strength[loser, k] = -np.inf
                 if loser != u:
-                    out[loser] = -1
+                    assigned[loser] = -1
             u = -1 if max_rate else loser
 
 

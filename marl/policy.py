@@ -119,7 +119,8 @@ def _spread(rate: np.ndarray, away: np.ndarray) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _look(mission: Mission, outlook: Outlook, frame: Frame, e: int, seen: Seen, n: int) -> int:
+def _write_features(mission: Mission, outlook: Outlook, frame: Frame, e: int, seen: Seen, n: int,
+                    ) -> int:
     """Write features of flight `e`'s flying UAVs to `seen` from row `n`; return the next row."""
     battery, left = frame.battery[e], frame.data_units[e]
     uavs, devices = len(battery), len(left)
@@ -147,8 +148,8 @@ def _look(mission: Mission, outlook: Outlook, frame: Frame, e: int, seen: Seen, 
         for k in range(devices):
             seen.waiting[n, k] = waiting[k]
             if waiting[k]:
-                _look_at(mission, outlook, frame, e, u, k, drain[k], left.sum() / count, slack,
-                         seen.token[n, k])
+                _write_device_features(mission, outlook, frame, e, u, k, drain[k],
+                                       left.sum() / count, slack, seen.token[n, k])
         feasible(mission, u, row, column, battery[u], mask)
         for move in range(MOVE_COUNT):
             seen.mask[n, move] = mask[move]
@@ -168,8 +169,8 @@ def _look(mission: Mission, outlook: Outlook, frame: Frame, e: int, seen: Seen, 
 
 
 @njit(cache=True, nogil=True)
-def _look_at(mission: Mission, outlook: Outlook, frame: Frame, e: int, u: int, k: int,
-             drain: float, mean_left: float, slack: float, token: np.ndarray) -> None:
+def _write_device_features(mission: Mission, outlook: Outlook, frame: Frame, e: int, u: int, k: int,
+                           drain: float, mean_left: float, slack: float, token: np.ndarray) -> None:
     """Write the features of device `k` for UAV `u` of flight `e` to `token` (TOKEN,).
 
     `drain` is the slots needed to collect its data, `mean_left` the mean data of waiting devices,
@@ -214,21 +215,21 @@ def _look_at(mission: Mission, outlook: Outlook, frame: Frame, e: int, u: int, k
 
 
 @njit(cache=True, nogil=True)
-def _look_around(mission: Mission, outlook: Outlook, frame: Frame, seen: Seen) -> int:
+def _write_features_of_flights(mission: Mission, outlook: Outlook, frame: Frame, seen: Seen) -> int:
     """Write the features of all UAVs flying in a mission to `seen`; return their number."""
     n = 0
     for e in range(len(frame.battery)):
-        n = _look(mission, outlook, frame, e, seen, n)
+        n = _write_features(mission, outlook, frame, e, seen, n)
     return n
 
 
 @njit(cache=True, nogil=True)
-def _look_everywhere(missions: "List[Mission]", outlooks: "List[Outlook]", frames: "List[Frame]",
-                     seen: Seen) -> int:
+def _write_features_of_worlds(missions: "List[Mission]", outlooks: "List[Outlook]",
+                              frames: "List[Frame]", seen: Seen) -> int:
     """Write the features of all UAVs flying in many worlds to `seen`; return their number."""
     n = 0
     for w in range(len(missions)):
-        n = _look(missions[w], outlooks[w], frames[w], 0, seen, n)
+        n = _write_features(missions[w], outlooks[w], frames[w], 0, seen, n)
     return n
 
 
@@ -279,7 +280,7 @@ class EntityPolicy:
     def act(self, frame: Frame) -> np.ndarray:
         """See `marl.flights.Policy`."""
         action = np.full(frame.battery.shape, NO_OP)
-        count = _look_around(self._mission, self._outlook, frame, self._seen)
+        count = _write_features_of_flights(self._mission, self._outlook, frame, self._seen)
         with torch.inference_mode():
             score = self._network(*self._seen.first(count))
         action[frame.battery > 0] = score.argmax(1).numpy()
@@ -326,7 +327,7 @@ def demonstrations(missions: list[Mission], iterations: int, rng: np.random.Gene
     outlooks = List([Outlook.of(mission) for mission in missions])
     seen, parts = Seen.blank(actions[0].size, devices), []
     for action in actions:
-        count = _look_everywhere(worlds.missions, outlooks, worlds.frames, seen)
+        count = _write_features_of_worlds(worlds.missions, outlooks, worlds.frames, seen)
         parts.append((*seen.first(count), torch.from_numpy(action[worlds.battery > 0])))
         worlds.step(action)
     return [torch.cat(each) for each in zip(*parts)]

@@ -61,7 +61,7 @@ class ReplanPolicy:
         """See `marl.flights.Policy`; the map of the mission that is flown is not read."""
         self._slot = 0
         minds = 1 if self._linked else self._mission.uavs
-        self._flights = [[_Mind(self, range(self._mission.uavs) if self._linked else [u])
+        self._flights = [[_Knowledge(self, range(self._mission.uavs) if self._linked else [u])
                           for u in range(minds)] for _ in range(flights)]
         first, uavs = self._first, self._mission.uavs
         self._tour = np.tile(first.tour, (flights, 1, 1, 1))
@@ -72,8 +72,8 @@ class ReplanPolicy:
         """See `marl.flights.Policy`."""
         for flight, minds in enumerate(self._flights):
             if frame.battery[flight].any():
-                for mind in minds:
-                    mind.look(frame, flight, self._slot)
+                for knowledge in minds:
+                    knowledge.receive(frame, flight, self._slot)
                 if len(minds) > 1:
                     self._meet(frame, flight)
                 if self._slot and self._slot % self._every == 0:
@@ -87,16 +87,16 @@ class ReplanPolicy:
         """Exchange readings and planned tours between UAVs whose SNR reaches the threshold."""
         mission, minds = self._mission, self._flights[flight]
         cell = frame.cell[flight].astype(float) * mission.step_m
-        for u, mind in enumerate(minds):
+        for u, knowledge in enumerate(minds):
             for v in range(u):
                 if not (frame.battery[flight, u] and frame.battery[flight, v]):
                     continue
                 away_m = np.hypot(np.hypot(*(cell[u] - cell[v])),
                                   mission.altitude_m[u] - mission.altitude_m[v])
                 if uav_snr_db(mission, float(away_m)) >= mission.threshold_db:
-                    mind.learn_from(minds[v])
-                    minds[v].learn_from(mind)
-                    for one, other in ((mind, v), (minds[v], u)):
+                    knowledge.learn_from(minds[v])
+                    minds[v].learn_from(knowledge)
+                    for one, other in ((knowledge, v), (minds[v], u)):
                         one.others[other] = (
                             self._slot, frame.cell[flight, other].astype(np.int64),
                             int(frame.battery[flight, other]),
@@ -111,18 +111,19 @@ class ReplanPolicy:
         """Improve a flight's remaining tours: of linked UAVs all together, of others one by one."""
         cell, battery = (array[flight].astype(np.int64) for array in (frame.cell, frame.battery))
         tours = [self._remaining_tour(flight, u) for u in range(self._mission.uavs)]
-        for u, mind in enumerate(self._flights[flight]):
+        for u, knowledge in enumerate(self._flights[flight]):
             if self._linked:
                 # A device that no UAV hears is not served, so its data stay as seen last.
-                found = self._improved(mind, cell, battery, mind.seen, tours, -1)
-                self._take(flight, range(len(tours)), found)
+                found = self._improved(knowledge, cell, battery, knowledge.seen, tours, -1)
+                self._replace_tours(flight, range(len(tours)), found)
             elif battery[u]:
-                cells, batteries, believed = self._believed_of_others(mind)
+                cells, batteries, believed = self._believed_of_others(knowledge)
                 cells[u], batteries[u], believed[u] = cell[u], battery[u], tours[u]
-                found = self._improved(mind, cells, batteries, self._left(mind), believed, u)
-                self._take(flight, [u], found)
+                found = self._improved(knowledge, cells, batteries, self._left(knowledge),
+                                       believed, u)
+                self._replace_tours(flight, [u], found)
 
-    def _believed_of_others(self, mind: "_Mind",
+    def _believed_of_others(self, knowledge: "_Knowledge",
                             ) -> tuple[np.ndarray, np.ndarray, list[tuple[np.ndarray, int]]]:
         """Return cells, batteries and remaining tours of all UAVs, as one UAV assumes them.
 
@@ -133,7 +134,7 @@ class ReplanPolicy:
         cells, batteries = cells.copy(), batteries.copy()
         tours = [_remaining(self._first.tour[v], self._first.visits[v], passed[0][v], passed[1][v])
                  for v in range(self._mission.uavs)]
-        for v, (slot, cell, battery, tour) in mind.others.items():
+        for v, (slot, cell, battery, tour) in knowledge.others.items():
             # Simulate that UAV from the slot in which they met until now.
             start = self._planned._replace(start=cell[None], battery=np.array([battery]),
                                            level=np.zeros(1, dtype=np.int64),
@@ -145,22 +146,22 @@ class ReplanPolicy:
             tours[v] = _remaining(*tour, int(course[3][now, 0]), int(course[4][now, 0]))
         return cells, batteries, tours
 
-    def _left(self, mind: "_Mind") -> np.ndarray:
+    def _left(self, knowledge: "_Knowledge") -> np.ndarray:
         """Return the data (K,) that a UAV without a link assumes to be left.
 
         It is the amount seen last, less the share that the first plan would have collected since.
         """
         planned, devices = self._expected[2], np.arange(self._mission.devices)
-        before = planned[mind.seen_in, devices]
+        before = planned[knowledge.seen_in, devices]
         kept = np.divide(planned[self._slot], before, out=np.zeros(len(before)), where=before > 0)
-        return mind.seen * kept
+        return knowledge.seen * kept
 
-    def _improved(self, mind: "_Mind", cell: np.ndarray, battery: np.ndarray, left: np.ndarray,
-                  tours: list[tuple[np.ndarray, int]], only: int) -> Plan | None:
+    def _improved(self, knowledge: "_Knowledge", cell: np.ndarray, battery: np.ndarray,
+                  left: np.ndarray, tours: list[tuple[np.ndarray, int]], only: int) -> Plan | None:
         """Improve the tour of UAV `only` (-1: all) by a UAV's belief; None if no data are left."""
         data_units, value = np.maximum(left, 0.0).astype(float), self._value
-        if mind.belief is not None:
-            data_units, value = weighted(mind.belief, data_units)
+        if knowledge.belief is not None:
+            data_units, value = weighted(knowledge.belief, data_units)
         mission = self._planned._replace(start=cell, battery=battery, data_units=data_units)
         if not mission.data_units.any():
             return None
@@ -168,7 +169,7 @@ class ReplanPolicy:
                        np.array([count for _, count in tours]), self._iterations, self._rng,
                        only=only, temperature=LOW_TEMPERATURE)
 
-    def _take(self, flight: int, uavs: Iterable[int], found: Plan | None) -> None:
+    def _replace_tours(self, flight: int, uavs: Iterable[int], found: Plan | None) -> None:
         """Replace the tours of some UAVs in a flight by those of a plan; None: keep them."""
         if found is not None:
             for u in uavs:
@@ -176,7 +177,7 @@ class ReplanPolicy:
                 self._reached[flight, u] = self._hovered[flight, u] = 0
 
 
-class _Mind:
+class _Knowledge:
     """Knowledge of one UAV in a flight, or of all UAVs with a link.
 
     Attributes:
@@ -197,7 +198,7 @@ class _Mind:
         self._readings: dict[int, list[tuple[int, np.ndarray, np.ndarray]]] = {
             u: [] for u in range(mission.uavs)}
 
-    def look(self, frame: Frame, flight: int, slot: int) -> None:
+    def receive(self, frame: Frame, flight: int, slot: int) -> None:
         """Update belief and data left by the SNRs that its own UAVs receive in a slot."""
         for u in self._uavs:
             if not frame.battery[flight, u]:
@@ -208,7 +209,7 @@ class _Mind:
             self.seen_in = np.where(heard, slot, self.seen_in)
             self._hear(u, slot, frame.cell[flight, u].astype(np.int64), snr_db.copy())
 
-    def learn_from(self, other: "_Mind") -> None:
+    def learn_from(self, other: "_Knowledge") -> None:
         """Copy another UAV's new readings, and its counts of data left that are more recent."""
         later = other.seen_in > self.seen_in
         self.seen = np.where(later, other.seen, self.seen)

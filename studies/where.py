@@ -23,13 +23,12 @@ from radiotwin import Measurements, Scene
 from radiotwin.closeloop.crossfit import CrossFit, make_folds
 from radiotwin.closeloop.families import Readings, families_of, units_of
 from radiotwin.closeloop.run import fit_base
-from radiotwin.closeloop.scan import Anomaly, scan
-from radiotwin.closeloop.scan import compare as compare_groups
+from radiotwin.closeloop.scan import Anomaly, log_odds_of_groups, scan
 from radiotwin.links import prepare_links
 from radiotwin.links.checks import move_anchors_out
 from radiotwin.links.correlation import moving_end_m
 from radiotwin.links.evidence import thin_links
-from radiotwin.links.limits import limits_to_explain
+from radiotwin.links.limits import with_usual_limits
 from studies.runner import Study
 from studies.tables import markdown, number
 from studies.where_pivot import THRESHOLD, robust_z, shrunken
@@ -89,7 +88,7 @@ def hidden_case(settings: dict) -> tuple[Measurements, Scene, list[dict], list[n
 def base_of(measurements: Measurements, scene: Scene, seed: int) -> CrossFit:
     """Return the base that `close_loop` takes."""
     links = move_anchors_out(prepare_links(measurements, scene), scene)
-    links = limits_to_explain(thin_links(links, seed))
+    links = with_usual_limits(thin_links(links, seed))
     return fit_base(links, scene, make_folds(links, seed), seed=seed)[2]
 
 
@@ -152,7 +151,7 @@ def _ends_without(readings: Readings, wrong: np.ndarray) -> set[Ends]:
                 if each.name in ENDS or each.pairs]
     return {(table.family.name, frozenset(table.family.describe(int(group))[0].items()),
              UNITED.get(table.statistic, table.statistic))
-            for table in compare_groups(left, families, units)
+            for table in log_odds_of_groups(left, families, units)
             for group in np.flatnonzero(table.log_odds > 0)}
 
 

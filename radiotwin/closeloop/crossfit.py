@@ -359,7 +359,7 @@ class CrossFit:
                 np.log(QUALITIES) - logsumexp([-model.held_out_nll for model in each], axis=0))
 
     @cached_property
-    def unforeseen(self) -> np.ndarray:
+    def not_learnable(self) -> np.ndarray:
         """(n,) bool, links affected by a fault that no training link of their fold shows.
 
         A fault of one flight cannot be predicted from other flights, so such links are not scored.

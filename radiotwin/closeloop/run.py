@@ -56,7 +56,7 @@ from radiotwin.links import Links, prepare_links
 from radiotwin.links.alignment import as_measurements
 from radiotwin.links.checks import move_anchors_out
 from radiotwin.links.evidence import MAX_LINKS, SAMPLE_LINKS, thin_links
-from radiotwin.links.limits import limits_to_explain
+from radiotwin.links.limits import with_usual_limits
 from radiotwin.links.measurements import Measurements
 from radiotwin.runtime.execution import Executor
 from radiotwin.scene import Scene
@@ -189,9 +189,9 @@ class Loop(Summarised):
     @cached_property
     def detectable(self) -> list[Detectable]:
         """Least size from which each effect would have been named; empty if none was tried."""
-        if self.found.looked_at is None:
+        if self.found.last_hypotheses is None:
             return []
-        model, hypotheses = self.found.looked_at
+        model, hypotheses = self.found.last_hypotheses
         return detectable(model.whole.view, hypotheses, self.criteria,
                           [effect() for effect in catalogue()], model.whole.model.effect_names)
 
@@ -247,7 +247,7 @@ def close_loop(measurements: Measurements | pd.DataFrame | Path | str,
     all_links = prepare_links(measurements, scene)
     if scene is not None:  # anchors inside buildings are refused if the base uses line of sight
         all_links = move_anchors_out(all_links, scene, refuse=base != LogDistanceBase.name)
-    links = limits_to_explain(thin_links(all_links, seed))
+    links = with_usual_limits(thin_links(all_links, seed))
     folds = make_folds(links, seed, hold_out)
     links, fitted, model = fit_base(links, scene, folds, base, seed, on_progress)
     effects = tuple(effect() for effect in catalogue()

@@ -159,7 +159,7 @@ def scan_readings(readings: Readings) -> list[Anomaly]:
     taken: list[_Found] = []
     left, first = readings, None
     while len(found) < MAX_ANOMALIES:
-        compared = compare(left, families, units)
+        compared = log_odds_of_groups(left, families, units)
         first = first or compared
         rivals = _candidates(compared, first, taken)
         if not rivals:
@@ -167,7 +167,7 @@ def scan_readings(readings: Readings) -> list[Anomaly]:
         after = [(each, _without_group(left, each)) for each in rivals]
         best = 0
         if len(after) > 1:  # the group that explains most in devices, receivers, flights and pairs
-            best = int(np.argmin([_total_log_odds(compare(rest, end_families, units))
+            best = int(np.argmin([_total_log_odds(log_odds_of_groups(rest, end_families, units))
                                   - each.log_odds for each, rest in after]))
         chosen, left = after[best]
         taken.append(chosen)
@@ -176,7 +176,7 @@ def scan_readings(readings: Readings) -> list[Anomaly]:
 
 
 @dataclass(frozen=True, eq=False)
-class _SightClass:
+class _ValuesOfOneSight:
     """Values of one statistic on the LoS links, or on the NLoS links.
 
     Attributes:
@@ -216,7 +216,7 @@ class _SightClass:
             return values
         values = values.copy()
         values[groups.row] = subtract_unit_errors(values[groups.row], groups.group,
-                                                  self.units.lasting[groups.row])
+                                                  self.units.lasting_unit[groups.row])
         return values
 
     def compare(self, family: Family) -> PeerComparison | Curves | None:
@@ -263,7 +263,7 @@ class _SightClass:
         return compare_with_peers(found, prior, NLOS_DOF if heavy else LOS_DOF)
 
 
-def _classes(readings: Readings, units: Units) -> dict[str, dict[str, _SightClass]]:
+def _classes(readings: Readings, units: Units) -> dict[str, dict[str, _ValuesOfOneSight]]:
     """Return by statistic the values of LoS links (`los`) and of NLoS links (`nlos`).
 
     `base` is the raw residual; `level` and `scatter` are relative to the usual error of such links.
@@ -273,7 +273,7 @@ def _classes(readings: Readings, units: Units) -> dict[str, dict[str, _SightClas
     values = {"level": readings.residual_db - usual_db, "scatter": readings.residual_db - usual_db,
               "noise": readings.step_db, "blanks": readings.blank_excess,
               "base": readings.residual_db}
-    found: dict[str, dict[str, _SightClass]] = {name: {} for name in values}
+    found: dict[str, dict[str, _ValuesOfOneSight]] = {name: {} for name in values}
     heard = np.isfinite(readings.residual_db)
     for sight, is_los in (("los", True), ("nlos", False)):
         of_class = readings.los if is_los else ~readings.los
@@ -282,12 +282,13 @@ def _classes(readings: Readings, units: Units) -> dict[str, dict[str, _SightClas
         scale_db = max(robust_sd(readings.residual_db[of_class & heard]), LEAST_SCALE_DB)
         for name, each in values.items():
             rows = of_class & np.isfinite(each)
-            found[name][sight] = _SightClass(each, rows, "level" if name == "base" else name,
-                                             is_los, scale_db, units, LastingErrors(units, rows))
+            found[name][sight] = _ValuesOfOneSight(
+                each, rows, "level" if name == "base" else name, is_los, scale_db, units,
+                LastingErrors(units, rows))
     return found
 
 
-def compare(readings: Readings, families: list[Family], units: Units) -> list[Compared]:
+def log_odds_of_groups(readings: Readings, families: list[Family], units: Units) -> list[Compared]:
     """Return the log odds that each group of the families deviates from its peers.
 
     Each statistic is compared among LoS links, NLoS links and both together (`all`).

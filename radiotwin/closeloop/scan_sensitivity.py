@@ -13,7 +13,7 @@ from scipy.special import logit
 
 from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.closeloop.families import Readings, families_of, units_of
-from radiotwin.closeloop.scan import UNITS, Compared, compare, shift_group
+from radiotwin.closeloop.scan import UNITS, Compared, log_odds_of_groups, shift_group
 from radiotwin.closeloop.verdict.criteria import MIN_SURE
 from radiotwin.inference.groups import PeerComparison, Units
 
@@ -51,7 +51,7 @@ def least_deviations(model: CrossFit) -> list[LeastDeviation]:
         statistic for statistic in STATISTICS if statistic in each.statistics))
                 for each in families_of(readings, units)]
     sharpest: dict[tuple[str, str], tuple[Compared, int, float]] = {}
-    for each in compare(readings, families, units):
+    for each in log_odds_of_groups(readings, families, units):
         if isinstance(each.distance, PeerComparison):
             key, (group, sd) = (each.family.name, each.statistic), _typical_group(each.distance)
             if key not in sharpest or sd < sharpest[key][2]:
@@ -84,7 +84,7 @@ def _least_size(compared: Compared, group: int, sd: float, readings: Readings,
     rows, sure = family.groups.members(group, len(readings)), logit(MIN_SURE)
     size = FIRST_SIZE * sd
     while size <= MAX_SIZE[statistic]:
-        tables = compare(shift_group(readings, rows, statistic, size), [family], units)
+        tables = log_odds_of_groups(shift_group(readings, rows, statistic, size), [family], units)
         if max(each.log_odds[group] for each in tables) >= sure:
             return size
         size *= STEP

@@ -92,7 +92,7 @@ def build_links(source: Source, settings: Settings, tally: Tally, problems: Prob
     with problems.noted():
         source.require({name: spec for name, spec in columns.items()
                         if spec not in (BY_DAY, BY_POSITION)})
-    shared = _shared_columns(source, columns, settings, problems)
+    shared = _row_columns(source, columns, settings, problems)
     if "time_s" in shared and len(shared) and not problems:
         ends = [name for name in ("device", "receiver") if name in shared]
         shared["time_s"], note = past_midnights(
@@ -103,7 +103,7 @@ def build_links(source: Source, settings: Settings, tally: Tally, problems: Prob
             shared["flight"] = calendar_days(shared["time_s"].to_numpy(), settings.time_zone)
     bad_rows = source.bad_rows or BadRows()
     if not problems:
-        shared = bad_rows.without(shared, tally, len(levels), source.where)
+        shared = bad_rows.drop_noted(shared, tally, len(levels), source.where)
         source = source.select(source.table.index.isin(shared.index))
     ROWS.check(len(source) * len(levels), f"{source.path}: rows times columns of levels")
     parts = []
@@ -152,8 +152,8 @@ def _from_file_name(source: Source, name: str, spec: str, file_name: str) -> str
     return spec.replace(FILE_DATE, dates.pop())
 
 
-def _shared_columns(source: Source, columns: dict[str, str], settings: Settings,
-            problems: Problems) -> pd.DataFrame:
+def _row_columns(source: Source, columns: dict[str, str], settings: Settings,
+                 problems: Problems) -> pd.DataFrame:
     """Read times, positions and names of rows, which belong to all levels in a row.
 
     Errors are collected in `problems`, so that a message has all; the result is then incomplete.
@@ -217,7 +217,7 @@ def _rows_as_links(source: Source, level: LevelColumn, shared: pd.DataFrame, set
     links["level_db"] = levels.db
     links["reason"] = np.select([levels.not_measured, levels.impossible],
                                 ["not measured", "impossible level"], "")
-    links = (source.bad_rows or BadRows()).without(links, tally, 1, source.where)
+    links = (source.bad_rows or BadRows()).drop_noted(links, tally, 1, source.where)
     for reason in ("not measured", "impossible level"):
         links = tally.drop(links, links["reason"] == reason, reason, level.spec, source.where)
     links = links.drop(columns="reason")
@@ -366,7 +366,7 @@ def _drop_impossible_degrees(source: Source, links: pd.DataFrame, prefix: str, n
         hint = "; are latitude and longitude swapped in the mapping?" if swapped else ""
         source.refuse(spec, links[prefix + name], bad,
                       f"is no {name}; allowed are -{limit:g} to {limit:g} degrees{hint}")
-        return (source.bad_rows or BadRows()).without(links, tally, 1, source.where)
+        return (source.bad_rows or BadRows()).drop_noted(links, tally, 1, source.where)
     return tally.drop(links, bad, f"no {name} (beyond {limit:g}°)", spec, source.where)
 
 

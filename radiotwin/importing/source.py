@@ -42,7 +42,7 @@ class BadRows:
         limit: allowed number in all files, `skip_bad_rows`.
         prefix: of places in the present file: its name if there are several.
         rows: place, column, cell and reason of each row that is left out.
-        fresh: index -> column of the rows that `take` noted since the last `without`.
+        fresh: index -> column of the rows that `note_rows` noted since the last `drop_noted`.
     """
 
     limit: int = 0
@@ -58,8 +58,8 @@ class BadRows:
                                      "reason": reason.partition(";")[0]})
         return True
 
-    def take(self, source: "Source", spec: str, cells: pd.Series, rows: np.ndarray,
-             reason: str) -> bool:
+    def note_rows(self, source: "Source", spec: str, cells: pd.Series, rows: np.ndarray,
+                  reason: str) -> bool:
         """Note several bad rows of a column; return False, and note none, if that is too many."""
         index = [int(cells.index[row]) for row in rows] if len(rows) <= self.limit else []
         places = [source.where(each) for each in index]
@@ -74,8 +74,8 @@ class BadRows:
         """Return the end of a message: the option that leaves out `number` more rows."""
         return f"; --skip-bad-rows {len(self.rows) + number} leaves such rows out"
 
-    def without(self, links: pd.DataFrame, tally: "Tally", readings: int,
-                where: Callable[[int], str]) -> pd.DataFrame:
+    def drop_noted(self, links: pd.DataFrame, tally: "Tally", readings: int,
+                   where: Callable[[int], str]) -> pd.DataFrame:
         """Drop the links of rows that were noted since the last call, and count them in the tally.
 
         Each row counts as `readings` readings; noted rows are forgotten.
@@ -207,7 +207,7 @@ class Source:
             texts = self.table[spec].reindex(cells.index)
             cells = texts.where(texts.map(lambda cell: isinstance(cell, str)), cells)
         if self.bad_rows is not None:
-            if self.bad_rows.take(self, spec, cells, rows, reason):
+            if self.bad_rows.note_rows(self, spec, cells, rows, reason):
                 return
             if len(rows) < len(cells) / 2:  # else it is not the rows that are wrong
                 reason += self.bad_rows.hint(len(rows))

@@ -36,12 +36,12 @@ class Units:
     """Labels of n values that share errors.
 
     Attributes:
-        passing: (n,) label of values with correlated errors at one time.
-        lasting: (n,) label of values with correlated errors at all times; few and large.
+        passing_unit: (n,) label of values with correlated errors at one time.
+        lasting_unit: (n,) label of values with correlated errors at all times; few and large.
     """
 
-    passing: np.ndarray
-    lasting: np.ndarray
+    passing_unit: np.ndarray
+    lasting_unit: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,23 +52,23 @@ class Groups:
         row: (m,) index of the value of each membership.
         group: (m,) index of its group.
         count: number of groups k.
-        passing, lasting: (m,) number of its pair of group and unit.
-        of_passing, of_lasting: (pairs,) group of each pair.
+        passing_unit, lasting_unit: (m,) number of its pair of group and unit.
+        of_passing_unit, of_lasting_unit: (pairs,) group of each pair.
     """
 
     row: np.ndarray
     group: np.ndarray
     count: int
-    passing: np.ndarray
-    of_passing: np.ndarray
-    lasting: np.ndarray
-    of_lasting: np.ndarray
+    passing_unit: np.ndarray
+    of_passing_unit: np.ndarray
+    lasting_unit: np.ndarray
+    of_lasting_unit: np.ndarray
 
     @classmethod
     def of_members(cls, row: np.ndarray, group: np.ndarray, count: int, units: Units) -> Groups:
         """Build groups from memberships: rows (m,) and their groups (m,)."""
-        return cls(row, group, count, *_pairs(group, units.passing[row]),
-                   *_pairs(group, units.lasting[row]))
+        return cls(row, group, count, *_pairs(group, units.passing_unit[row]),
+                   *_pairs(group, units.lasting_unit[row]))
 
     @classmethod
     def of_labels(cls, label: np.ndarray, units: Units) -> Groups:
@@ -80,7 +80,7 @@ class Groups:
         """Keep only the members in a mask (n,)."""
         kept = rows[self.row]
         return replace(self, row=self.row[kept], group=self.group[kept],
-                       passing=self.passing[kept], lasting=self.lasting[kept])
+                       passing_unit=self.passing_unit[kept], lasting_unit=self.lasting_unit[kept])
 
     def members(self, group: int, n: int) -> np.ndarray:
         """Build the mask (n,) of a group's members."""
@@ -94,8 +94,8 @@ class LastingErrors:
 
     def __init__(self, units: Units, rows: np.ndarray) -> None:
         """Prepare the estimate for some rows (r,), a mask or indices."""
-        lasting = np.unique(units.lasting[rows], return_inverse=True)[1].ravel()
-        self._part, self._of_part = _pairs(lasting, units.passing[rows])
+        lasting = np.unique(units.lasting_unit[rows], return_inverse=True)[1].ravel()
+        self._part, self._of_part = _pairs(lasting, units.passing_unit[rows])
         self._size = np.bincount(self._part)
         self._parts = np.bincount(self._of_part)
 
@@ -220,14 +220,14 @@ def _with_error(value: np.ndarray, step: np.ndarray, influence: np.ndarray, grou
     """
     count = groups.count
     number = np.bincount(groups.group, minlength=count)
-    filled = np.bincount(groups.passing, minlength=len(groups.of_passing)) > 0
-    units = np.bincount(groups.of_passing, filled, count)
-    unit_influence = np.bincount(groups.passing, influence, len(groups.of_passing))
-    squares = np.bincount(groups.of_passing, unit_influence**2, count)
+    filled = np.bincount(groups.passing_unit, minlength=len(groups.of_passing_unit)) > 0
+    units = np.bincount(groups.of_passing_unit, filled, count)
+    unit_influence = np.bincount(groups.passing_unit, influence, len(groups.of_passing_unit))
+    squares = np.bincount(groups.of_passing_unit, unit_influence**2, count)
     sandwich = step * np.sqrt(squares * units / np.maximum(units - 1, 1))
-    share = np.bincount(groups.lasting, minlength=len(groups.of_lasting)).astype(float)
+    share = np.bincount(groups.lasting_unit, minlength=len(groups.of_lasting_unit)).astype(float)
     effective = np.maximum(
-        number**2 / np.maximum(np.bincount(groups.of_lasting, share**2, count), 1), 1.0)
+        number**2 / np.maximum(np.bincount(groups.of_lasting_unit, share**2, count), 1), 1.0)
     independent = step * np.sqrt(np.bincount(groups.group, influence**2, count))
     least = BIN_LEAST if is_bin else LEAST
     enough = (number >= least[0]) & (units >= least[1]) & (effective >= least[2])

@@ -46,7 +46,7 @@ def require_writable(path: Path | str) -> None:
     """
     path = Path(path)
     _refuse_folder(path)
-    with (_parent_of(path, only_tried=True), _reported(path),
+    with (_made_parents(path, only_tried=True), _reported(path),
           _temporary_folder(path) as folder):
         (folder / path.name).touch()
 
@@ -76,7 +76,7 @@ def atomic_path(path: Path | str, flush: bool = True) -> Iterator[Path]:
     """
     path = Path(path)
     _refuse_folder(path)
-    with _parent_of(path), _reported(path, only_disk=True), _temporary_folder(path) as folder:
+    with _made_parents(path), _reported(path, only_disk=True), _temporary_folder(path) as folder:
         temporary = folder / path.name
         with _reported(path):
             temporary.touch()
@@ -134,7 +134,7 @@ def atomic_folder(path: Path | str, names: Collection[str] | None = None) -> Ite
         RunFailed: the disk is full or failed; an older folder at `path` is unchanged.
     """
     path = Path(path)
-    with (_parent_of(path), _reported(path, only_disk=True),
+    with (_made_parents(path), _reported(path, only_disk=True),
           _temporary_folder(_temporaries_place(path)) as temporary):
         try:
             yield temporary
@@ -180,7 +180,7 @@ def require_folder(path: Path | str, names: Collection[str], mark: str | None = 
         unmarked = "" if is_earlier else f", and no {mark} of an earlier run"
         raise BadInput(f"{path} holds {', '.join(lost[:5])}{unmarked}, which the new content "
                        "would erase; move it away or choose another output folder")
-    with _parent_of(path, only_tried=True), _reported(path), _temporary_folder(place):
+    with _made_parents(path, only_tried=True), _reported(path), _temporary_folder(place):
         pass
 
 
@@ -422,7 +422,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _parent_of(path: Path, only_tried: bool = False) -> Iterator[None]:
+def _made_parents(path: Path, only_tried: bool = False) -> Iterator[None]:
     """Make the folders above `path` for the block; remove the new ones if it fails.
 
     With `only_tried`, they are removed in any case, if they are empty.

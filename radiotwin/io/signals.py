@@ -36,14 +36,14 @@ class _State:
         raising: whether a signal is raised, as during the work; else it ends the process.
         deferred: nesting depth of `deferred`.
         received: number of the first signal since the work began.
-        flying: the last `Stopped`, until it is freed.
+        on_its_way: the last `Stopped`, until it is freed.
         after: exit status of the finished work.
     """
 
     raising = False
     deferred = 0
     received: int | None = None
-    flying: weakref.ref | None = None
+    on_its_way: weakref.ref | None = None
     after: int | None = None
 
 
@@ -66,7 +66,7 @@ def handle() -> None:
 
 def begin() -> None:
     """Raise signals as `Stopped` from now on, as the work begins."""
-    _state.received, _state.flying, _state.deferred = None, None, 0
+    _state.received, _state.on_its_way, _state.deferred = None, None, 0
     sys.unraisablehook = _show_unraisable
     _state.raising = True
 
@@ -112,7 +112,7 @@ def deferred() -> Iterator[None]:
     finally:
         _state.deferred -= 1
         if _state.received is not None:
-            _raise_unless_flying()
+            _raise_stopped_once()
 
 
 @contextmanager
@@ -136,7 +136,7 @@ def _on_signal(number: int, frame: FrameType | None) -> None:
     if _state.raising:
         if _state.received is None:
             _state.received = number
-        _raise_unless_flying()
+        _raise_stopped_once()
     elif _state.after is not None:
         os._exit(_state.after)
     elif _state.received is None:  # otherwise its message is being written
@@ -156,10 +156,10 @@ def _ignore() -> None:
 def _on_alarm(number: int, frame: FrameType | None) -> None:
     """Raise a signal again that was swallowed."""
     if _state.raising and _state.received is not None:
-        _raise_unless_flying()
+        _raise_stopped_once()
 
 
-def _raise_unless_flying() -> None:
+def _raise_stopped_once() -> None:
     """Raise `Stopped` for a signal, unless one raised before is still on its way up.
 
     A timer tries again after `AGAIN_S`, as code on the way may swallow it. Deferred signals wait.
@@ -168,13 +168,13 @@ def _raise_unless_flying() -> None:
         return
     if hasattr(signal, "setitimer"):
         signal.setitimer(signal.ITIMER_REAL, AGAIN_S)
-    if _state.flying is None or _state.flying() is None:
+    if _state.on_its_way is None or _state.on_its_way() is None:
         raise _new()  # no variable here: the frame, in its traceback, would keep it alive
 
 
 def _new() -> Stopped:
     stopped = Stopped()
-    _state.flying = weakref.ref(stopped)
+    _state.on_its_way = weakref.ref(stopped)
     return stopped
 
 

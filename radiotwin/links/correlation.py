@@ -146,8 +146,8 @@ class Variogram:
         first: (p,) first link of each pair, a row.
         second: (p,) second link, of the same device, receiver and flight.
         index: (p,) distance bin of each pair.
-        fields: (1 + k, bins) semivariances of detrended white noise, and of a field of each length;
-            NaN in a bin without a sampled pair.
+        model_semivariances: (1 + k, bins) semivariances of detrended white noise, and of a
+            field of each length; NaN in a bin without a sampled pair.
         lengths_m: (k,) candidate correlation lengths, ascending [m].
     """
 
@@ -155,7 +155,7 @@ class Variogram:
     first: np.ndarray
     second: np.ndarray
     index: np.ndarray
-    fields: np.ndarray
+    model_semivariances: np.ndarray
     lengths_m: np.ndarray
 
     @classmethod
@@ -170,14 +170,16 @@ class Variogram:
         edges = np.geomspace(least_m, max(float(distance_m.max(initial=0)), 2 * least_m), BINS)
         index = np.searchsorted(edges, distance_m)
         return cls(trends, first, second, index,
-                   _fields(position_m, trends, first, second, index, lengths_m), lengths_m)
+                   _model_semivariances(position_m, trends, first, second, index, lengths_m),
+                   lengths_m)
 
     def length_m(self, z: np.ndarray) -> float:
         """Fit the correlation length [m] of residuals (n,), divided by their scale.
 
         The measured semivariance over distance (robust: Cressie and Hawkins) is compared with
-        `fields`, that of a model for each of `lengths_m`. The result is the shortest of these if
-        the residuals are uncorrelated, or too few distance bins have enough pairs.
+        `model_semivariances`, that of a model for each of `lengths_m`. The result is the
+        shortest of these if the residuals are uncorrelated, or too few distance bins have enough
+        pairs.
         """
         detrended = np.empty(len(z))
         for trend in self.trends:
@@ -186,14 +188,16 @@ class Variogram:
         root = np.sqrt(np.abs(detrended[self.first] - detrended[self.second]))
         mean = np.bincount(self.index, weights=root, minlength=BINS + 1) / np.maximum(pairs, 1)
         gamma = 0.5 * mean**4 / (0.457 + 0.494 / np.maximum(pairs, 1))  # Eq. 2.14
-        used = (pairs >= MIN_PAIRS) & np.isfinite(self.fields).all(axis=0)
+        used = (pairs >= MIN_PAIRS) & np.isfinite(self.model_semivariances).all(axis=0)
         if used.sum() < MIN_BINS:
             return float(self.lengths_m[0])
-        return _nearest(gamma[used], pairs[used], self.fields[:, used], self.lengths_m)
+        return _best_length_m(gamma[used], pairs[used], self.model_semivariances[:, used],
+                              self.lengths_m)
 
 
-def _fields(position_m: np.ndarray, trends: list[Trend], first: np.ndarray, second: np.ndarray,
-            index: np.ndarray, lengths_m: np.ndarray) -> np.ndarray:
+def _model_semivariances(position_m: np.ndarray, trends: list[Trend], first: np.ndarray,
+                         second: np.ndarray, index: np.ndarray, lengths_m: np.ndarray,
+                         ) -> np.ndarray:
     """Average the model semivariances of pairs of links in bins of distance.
 
     Pairs are rows `first` and `second` (p,) of links with both ends at `position_m` (n, d), both in
@@ -219,20 +223,21 @@ def _fields(position_m: np.ndarray, trends: list[Trend], first: np.ndarray, seco
     return np.where(weights > 0, sums / np.maximum(weights, 1e-9), np.nan)
 
 
-def _nearest(gamma: np.ndarray, pairs: np.ndarray, fields: np.ndarray,
-             lengths_m: np.ndarray) -> float:
+def _best_length_m(gamma: np.ndarray, pairs: np.ndarray, model_semivariances: np.ndarray,
+                   lengths_m: np.ndarray) -> float:
     """Return the correlation length [m] whose model semivariances fit the measured ones best.
 
     A nugget (uncorrelated part) and a sill (correlated part) of each length (k,) are fitted by
-    least squares to `gamma` (b,), measured in bins of `pairs` (b,) pairs; `fields` (1 + k, b) are
-    those of white noise, and of each length. It is the first length if no sill reaches a share
-    `MIN_CORRELATED`.
+    least squares to `gamma` (b,), measured in bins of `pairs` (b,) pairs; `model_semivariances`
+    (1 + k, b) are those of white noise, and of each length. It is the first length if no sill
+    reaches a share `MIN_CORRELATED`.
     """
     # Bins are dependent: beyond some hundreds of pairs, more make a bin no more certain.
     weight = np.sqrt(np.minimum(pairs, 500)) / np.maximum(gamma, 0.05 * gamma.max(initial=1e-9))
-    best, found = nnls((weight * fields[0])[:, None], weight * gamma)[1], float(lengths_m[0])
-    for length_m, field in zip(lengths_m.tolist(), fields[1:], strict=True):
-        (nugget, sill), misfit = nnls(np.column_stack([fields[0], field]) * weight[:, None],
+    noise, *fields = model_semivariances
+    best, found = nnls((weight * noise)[:, None], weight * gamma)[1], float(lengths_m[0])
+    for length_m, field in zip(lengths_m.tolist(), fields, strict=True):
+        (nugget, sill), misfit = nnls(np.column_stack([noise, field]) * weight[:, None],
                                       weight * gamma)
         if misfit < best and sill >= MIN_CORRELATED * (nugget + sill):
             best, found = misfit, length_m

@@ -51,7 +51,7 @@ def _evidence(links: Links) -> np.ndarray:
     if links.evidence is not None:
         return links.evidence
     width_m = evidence_width_m(links, UNKNOWN_M)
-    return _pieces(links, width_m, width_m)
+    return _group_indices(links, width_m, width_m)
 
 
 def with_evidence(links: Links, z: np.ndarray) -> Links:
@@ -63,7 +63,7 @@ def with_evidence(links: Links, z: np.ndarray) -> Links:
     """
     length_m = correlation_length_m(links, z)
     width_m = evidence_width_m(links, length_m)
-    pieces = _pieces(links, width_m, evidence_width_m(links, PLACE_LENGTHS * length_m))
+    pieces = _group_indices(links, width_m, evidence_width_m(links, PLACE_LENGTHS * length_m))
     squares, notes = _squares_occupied(moving_end_m(links), width_m), []
     if squares < FEW_SQUARES:
         notes.append(f"links within {width_m:.0f} m of each other err alike, and the campaign has "
@@ -89,7 +89,7 @@ def _squares_occupied(position_m: np.ndarray, width_m: float) -> int:
     return len(np.unique(np.floor(position_m[:, :2] / width_m), axis=0))
 
 
-def _pieces(links: Links, width_m: float, place_m: float) -> np.ndarray:
+def _group_indices(links: Links, width_m: float, place_m: float) -> np.ndarray:
     """Group links by squares of ground; return two group indices of each link, (n, 2).
 
     First, links with both ends in the same squares of side `width_m`, of one device, receiver and

@@ -149,15 +149,16 @@ class LimitEstimate:
         return self.nats > MIN_NATS
 
 
-def receiver_limit(level_db: np.ndarray, mean_db: np.ndarray, scale_db: np.ndarray, as_one: float,
-                   declared_db: float = -np.inf) -> LimitEstimate | None:
+def receiver_limit(level_db: np.ndarray, mean_db: np.ndarray, scale_db: np.ndarray,
+                   links_per_observation: float, declared_db: float = -np.inf,
+                   ) -> LimitEstimate | None:
     """Estimate the weakest level that one receiver detects; None with few readings or blanks.
 
     Args:
         level_db: (n,) readings [dB]; NaN: not detected.
         mean_db: (n,) predicted levels [dB].
         scale_db: (n,) scale of their errors, Student-t with `DOF` degrees of freedom [dB].
-        as_one: number of links that count as one, see `design_effect`.
+        links_per_observation: number of links that count as one, see `design_effect`.
         declared_db: declared limit to compare with [dB]; -inf: none.
     """
     blank = np.isnan(level_db)
@@ -169,7 +170,8 @@ def receiver_limit(level_db: np.ndarray, mean_db: np.ndarray, scale_db: np.ndarr
     count = min(int((high_db - low_db + BELOW_DB) / STEP_DB) + 2, MAX_STEPS)
     tried_db = np.append(np.linspace(low_db - BELOW_DB, high_db, count),
                          declared_db if np.isfinite(declared_db) else low_db)
-    nats, no_limit_nats = _limit_nats(tried_db, read_db, mean_db[blank], scale_db[blank], as_one)
+    nats, no_limit_nats = _log_likelihoods(tried_db, read_db, mean_db[blank], scale_db[blank],
+                                           links_per_observation)
     nats, declared = nats[:-1], nats[-1]
     weight = np.exp(nats - nats.max())
     weight /= weight.sum()
@@ -180,14 +182,15 @@ def receiver_limit(level_db: np.ndarray, mean_db: np.ndarray, scale_db: np.ndarr
     return LimitEstimate(limit_db, float(np.sqrt(variance)), odds, over_declared)
 
 
-def _limit_nats(tried_db: np.ndarray, read_db: np.ndarray, mean_db: np.ndarray,
-                scale_db: np.ndarray, as_one: float) -> tuple[np.ndarray, float]:
+def _log_likelihoods(tried_db: np.ndarray, read_db: np.ndarray, mean_db: np.ndarray,
+                     scale_db: np.ndarray, links_per_observation: float,
+                     ) -> tuple[np.ndarray, float]:
     """Return the log-likelihood [nats] of candidate limits of detection (k,), and of no limit.
 
     Given are the readings, ascending, and for the blanks (not detected) the predicted level
     `mean_db` and its error `scale_db` (m,), all in dB. A blank is below the limit, or lost at any
-    level; the lost share and the width of the transition are averaged over. `as_one` links count as
-    one observation.
+    level; the lost share and the width of the transition are averaged over.
+    `links_per_observation` links count as one observation.
     """
     readings, blanks = len(read_db), len(mean_db)
     mean_db = np.round(mean_db / BIN_DB) * BIN_DB
@@ -202,10 +205,10 @@ def _limit_nats(tried_db: np.ndarray, read_db: np.ndarray, mean_db: np.ndarray,
     of_readings = np.array([
         np.log(OUTLIER + (1 - OUTLIER) * ndtr((near - tried_db[:, None]) / width)) @ times
         for width in WIDTHS_DB])
-    both = (of_readings[:, None] + of_blanks) / as_one
+    both = (of_readings[:, None] + of_blanks) / links_per_observation
     prior = np.array(WIDTH_SHARES)[:, None, None] / len(lost)
     nats = logsumexp(both, axis=(0, 1), b=prior)
-    return nats, (blanks * np.log(share) + readings * np.log1p(-share)) / as_one
+    return nats, (blanks * np.log(share) + readings * np.log1p(-share)) / links_per_observation
 
 
 def estimate_limits(links: Links, declared_db: float | None) -> tuple[np.ndarray, list[str]]:
@@ -331,10 +334,12 @@ def _estimates(links: Links, rows: list[np.ndarray], declared_db: float,
         crude = crude_level(links.level_db, limits_db[links.receiver], links.distance_m,
                             links.device, links.receiver)
         z = np.where(blank, 0.0, (links.level_db - crude.mean_db) / crude.sd_db)
-        as_one, scale_db = design_effect(block, z), np.full(len(links), SD_SHARE * crude.sd_db)
+        links_per_observation = design_effect(block, z)
+        scale_db = np.full(len(links), SD_SHARE * crude.sd_db)
         *found, pooled = [
-            receiver_limit(links.level_db[part], crude.mean_db[part], scale_db[part], as_one,
-                           declared_db) for part in (*rows, np.arange(len(links)))]
+            receiver_limit(links.level_db[part], crude.mean_db[part], scale_db[part],
+                           links_per_observation, declared_db)
+            for part in (*rows, np.arange(len(links)))]
         before_db, limits_db = limits_db, np.array([
             each.limit_db if each is not None and each.is_sure else limit_db
             for each, limit_db in zip(found, limits_db, strict=True)])
@@ -403,7 +408,7 @@ def _limit_text(name: str, limit_db: float, found: LimitEstimate | None, unit: s
     return f"{limit_db:.1f}{how} {unit} for {name}"
 
 
-def limits_to_explain(links: Links) -> Links:
+def with_usual_limits(links: Links) -> Links:
     """Give receivers that detect too little the usual limit of detection, not their own.
 
     Blanks (not detected) that are predicted above this limit then need another explanation. Such a

@@ -3,7 +3,7 @@
 A part is the result of a function. Its name is the hash of the inputs, of the sources of this
 package, and of the versions of the libraries that compute it, so that no part is ever out of date.
 
-Parts are cached inside `with keep_pieces():`; elsewhere `kept` only calls the function.
+Parts are cached inside `with keep_pieces():`; elsewhere `cached` only calls the function.
 """
 
 from __future__ import annotations
@@ -215,8 +215,8 @@ def keeps() -> bool:
     return bool(_stores)
 
 
-def kept(kind: str, inputs: tuple, make: Callable[[], T], pack: Callable[[T], Piece | None],
-         unpack: Callable[[dict[str, np.ndarray], Any], T]) -> T:
+def cached(kind: str, inputs: tuple, make: Callable[[], T], pack: Callable[[T], Piece | None],
+           unpack: Callable[[dict[str, np.ndarray], Any], T]) -> T:
     """Return the result of `make()`, from the cache if it is there.
 
     Args:
@@ -226,14 +226,14 @@ def kept(kind: str, inputs: tuple, make: Callable[[], T], pack: Callable[[T], Pi
         pack: result -> arrays and JSON data; None: it is not cached.
         unpack: the inverse, to the bit; an error means that the part is damaged.
     """
-    return kept_with_name(kind, inputs, make, pack, unpack)[0]
+    return cached_with_name(kind, inputs, make, pack, unpack)[0]
 
 
-def kept_with_name(kind: str, inputs: tuple, make: Callable[[], T],
-                   pack: Callable[[T], Piece | None],
-                   unpack: Callable[[dict[str, np.ndarray], Any], T]) -> tuple[T, str]:
-    """Return the result of `make()` like `kept`, and its name in the cache; `""` if not cached."""
-    parts: KeptParts[None, T] = KeptParts(kind, lambda _: inputs, pack, unpack)
+def cached_with_name(kind: str, inputs: tuple, make: Callable[[], T],
+                     pack: Callable[[T], Piece | None],
+                     unpack: Callable[[dict[str, np.ndarray], Any], T]) -> tuple[T, str]:
+    """Return the result of `make()` like `cached`, and its name in the cache; `""`: it has none."""
+    parts: ResultCache[None, T] = ResultCache(kind, lambda _: inputs, pack, unpack)
     name = parts.name(None)
     if not name:
         return make(), ""
@@ -248,12 +248,12 @@ def kept_with_name(kind: str, inputs: tuple, make: Callable[[], T],
 
 
 @dataclass(frozen=True, eq=False)
-class KeptParts(Generic[P, T]):
+class ResultCache(Generic[P, T]):
     """`jobs.Cache` over the store in use, for parts of one kind.
 
     Attributes:
-        kind, pack, unpack: see `kept`.
-        inputs: piece -> everything that its result depends on, see `kept`.
+        kind, pack, unpack: see `cached`.
+        inputs: piece -> everything that its result depends on, see `cached`.
     """
 
     kind: str

@@ -14,7 +14,7 @@ from radiotwin.errors import BadInput, RunFailed
 from radiotwin.runtime.console import progress
 from radiotwin.runtime.execution import Executor, Job, LocalPool
 from radiotwin.runtime.jobs import peak_bytes
-from radiotwin.runtime.pieces import kept
+from radiotwin.runtime.pieces import cached
 from radiotwin.scene import Scene
 from radiotwin.trace.link_job import (
     LinkBatch,
@@ -236,9 +236,9 @@ def _draw_calls(points_m: np.ndarray, index: Sequence[int], seed: int
 def _try_quality(scene: Scene, quality: str, settings: SolverSettings,
                  calls: list[tuple[int, np.ndarray]]) -> Rung:
     """Solve sampled links with a quality and with ten times its rays, and compare the gains."""
-    solved = [kept("pilot", (scene.content_hash(), one.attributes(), *calls),
-                   partial(_solve_pilot, scene, one, calls),
-                   lambda found: ({"found": found}, None), lambda arrays, _: arrays["found"])
+    solved = [cached("pilot", (scene.content_hash(), one.attributes(), *calls),
+                     partial(_solve_pilot, scene, one, calls),
+                     lambda found: ({"found": found}, None), lambda arrays, _: arrays["found"])
               for one in (settings, settings.finer(FINER))]
     coarse, finer = solved[0][:-1], solved[1][:-1]
     both = np.isfinite(coarse) & np.isfinite(finer)

@@ -26,7 +26,7 @@ from radiotwin.links.site_table import read_site_table
 from radiotwin.maps.file import check_target
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.runtime.execution import Executor
-from radiotwin.runtime.pieces import KeptParts
+from radiotwin.runtime.pieces import ResultCache
 from radiotwin.scene import Scene
 from radiotwin.scene.antennas import Antenna
 from radiotwin.scene.citymap import FAR_M, CityMap
@@ -424,8 +424,8 @@ def trace_gains(scene: Scene, device_m: np.ndarray, points_m: np.ndarray, settin
 
     gains = (executor or Executor()).run(
         link_job(scene, settings, "tracing"), pieces,
-        KeptParts("gains", inputs, lambda found: ({"gain_db": found}, len(found)),
-                  lambda arrays, count: arrays["gain_db"].reshape(count)))
+        ResultCache("gains", inputs, lambda found: ({"gain_db": found}, len(found)),
+                    lambda arrays, count: arrays["gain_db"].reshape(count)))
     gain_db = np.empty((len(device_m), len(points_m)))
     gain_db[:, order] = np.concatenate([np.zeros(0), *gains]).reshape(gain_db.shape)
     return gain_db

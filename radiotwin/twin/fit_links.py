@@ -15,7 +15,7 @@ from radiotwin.links.prepare import ASSUMED_HEIGHT_M
 from radiotwin.propagation.laws import ChannelModel, check_fit_data, fit_once
 from radiotwin.propagation.laws.base import MIN_DETECTED
 from radiotwin.propagation.laws.published import PublishedLaw
-from radiotwin.runtime.pieces import kept
+from radiotwin.runtime.pieces import cached
 from radiotwin.scene import Scene
 from radiotwin.twin.localize import LawError, LocalizeSettings, TwinDevice, localize
 from radiotwin.twin.model.model import FittedModel
@@ -192,9 +192,9 @@ def _locate(links: Links, scene: Scene, channel: ChannelModel, law_error: LawErr
         "z_m": np.nan_to_num(links.device_m[unknown, 2], nan=ASSUMED_HEIGHT_M),
         "limit_db": limit_db, "seed": seed, "law_error": law_error,
         "start_m": start_m, "settings": settings, **declared}
-    return kept("positions", (*measured, options), partial(localize, *measured, **options),
-                lambda found: ({}, [each.record for each in found]),
-                lambda _, content: [TwinDevice.from_record(each) for each in content])
+    return cached("positions", (*measured, options), partial(localize, *measured, **options),
+                  lambda found: ({}, [each.record for each in found]),
+                  lambda _, content: [TwinDevice.from_record(each) for each in content])
 
 
 def make_twin(links: Links, scene: Scene | None, channel: ChannelModel,

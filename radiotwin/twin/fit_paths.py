@@ -24,7 +24,7 @@ from radiotwin.propagation.laws.map_error import (
 from radiotwin.propagation.laws.path_kriging import PathKriging
 from radiotwin.runtime.console import progress
 from radiotwin.runtime.execution import Executor
-from radiotwin.runtime.pieces import kept
+from radiotwin.runtime.pieces import cached
 from radiotwin.scene import Scene
 from radiotwin.scene.citymap import CityMap, perturbed_map
 from radiotwin.twin.fit_links import fit_links, make_twin, reliable_m
@@ -261,8 +261,8 @@ def _channel(links: Links, devices: list[TwinDevice], found: Found, seed: int) -
     known = links.with_located_devices(reliable_m(devices))
     data = *known.gains(PathKriging(found).declared_db(known)), seed
     inputs = PathKriging, *data, str(found[0].state()), found[1], lost
-    return kept("channel", inputs, lambda: PathKriging(found, lost).fit(*data), PathKriging.state,
-                PathKriging.from_state)
+    return cached("channel", inputs, lambda: PathKriging(found, lost).fit(*data), PathKriging.state,
+                  PathKriging.from_state)
 
 
 def _radius_by_map_m(links: Links, devices: list[TwinDevice], channel: ImagePaths,

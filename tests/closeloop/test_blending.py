@@ -77,7 +77,7 @@ def test_a_twin_of_a_fold_predicts_what_was_scored(devices_move, monkeypatch, tm
         monkeypatch.setattr(module, "grow_trees", grown)
     links, used = links_of(devices_move), []
     model = folded(links)
-    def weigh(held_out, away, names, half_m, dof):
+    def weigh(held_out, quadrants, names, half_m, dof):
         used.append(replace(SHARES, half_m=half_m))
         return used[-1]
     monkeypatch.setattr(predictor, "combination", weigh)

@@ -103,7 +103,7 @@ def keep_best(monkeypatch):
     """Function that keeps the best of some candidates; `several` is what is found of one kind."""
     def run(state, tried, several=()):
         for name, stand_in in (("_refit_exactly", lambda model: model),
-                               ("_devices_on_one_mast", lambda _: 0), ("_repeat", lambda *_: several)):
+                               ("_devices_on_one_mast", lambda _: 0), ("_add_repeats", lambda *_: several)):
             monkeypatch.setattr(causes, name, stand_in)
         return causes._keep_best(state, tried, None, INPUTS).log
     return run

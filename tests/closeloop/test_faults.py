@@ -79,8 +79,8 @@ def test_an_episode_is_as_well_known_as_the_flight_it_was_on_tells(found):
 def test_nobody_knew_the_episode_before_its_flight_and_nothing_else_is_judged_by_it(found):
     model = found.after
     during = (model.links.time_s >= BEGIN_S) & (model.links.time_s <= END_S)
-    np.testing.assert_array_equal(model.unforeseen, during)
-    assert not found.before.unforeseen.any()
+    np.testing.assert_array_equal(model.not_learnable, during)
+    assert not found.before.not_learnable.any()
     assert "time_s" not in {each.variable for each in found.remaining}
 
 
@@ -193,4 +193,4 @@ def test_of_two_faults_each_is_unforeseen_where_its_flight_was_held_out():
     first, second = on_links(effect, 10, 30), on_links(effect, 60, 80)
     folds = model_of(second), model_of(first)  # each learnt from the other half
     model = CrossFit(model_of(first, second), folds, index, None)
-    np.testing.assert_array_equal(model.unforeseen, first[1].acts | second[1].acts)
+    np.testing.assert_array_equal(model.not_learnable, first[1].acts | second[1].acts)

@@ -9,7 +9,7 @@ from radiotwin.closeloop.search.stages import SearchInputs, SearchState, search
 from radiotwin.effects.catalogue.detection_limit import DetectionLimit
 from radiotwin.effects.catalogue.gain_offsets import ReceiverGainOffset
 from radiotwin.links import prepare_links
-from radiotwin.links.limits import limits_to_explain
+from radiotwin.links.limits import with_usual_limits
 
 LIMIT_DB = -97.0
 
@@ -24,7 +24,7 @@ def test_one_fault_has_one_name(open_ground, off_db, limit_moves, named):
     world.gain_db += np.where(mine, off_db, 0.0)
     world.gain_db[world.gain_db < limit_db] = np.nan
     world.limit_db = -np.inf
-    links = limits_to_explain(prepare_links(open_ground.measured(world), None))
+    links = with_usual_limits(prepare_links(open_ground.measured(world), None))
     folds = make_folds(links, 0)
     base = LogDistanceBase(None, 0)
     model = cross_validate(links, base, folds)

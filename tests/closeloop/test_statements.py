@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from radiotwin.closeloop.output.result_file import _explained_share, consistent_sizes, same_over
+from radiotwin.closeloop.output.result_file import _explained_share, consistent_sizes, constant_over
 from radiotwin.closeloop.scan import scan
 from radiotwin.closeloop.scan_sensitivity import least_deviations
 from radiotwin.closeloop.verdict.sensitivity import Detectable
@@ -57,9 +57,9 @@ def test_a_level_is_said_of_all_flights_and_directions_only_where_it_is_seen_the
     links = SimpleNamespace(level_db=level_db, flight=flight, azimuth_deg=45.0 * octant + 20.0)
     base = SimpleNamespace(links=links, held_out_mean_db=np.zeros(len(device)))
     found = SimpleNamespace(statistic="level", family="device", rows=device == 1, size=SimpleNamespace(value=-6.0))
-    assert same_over(found, base) == over
+    assert constant_over(found, base) == over
     found.statistic = "scatter"
-    assert same_over(found, base) == []
+    assert constant_over(found, base) == []
 
 
 def test_what_was_seen_is_not_said_to_be_invisible():

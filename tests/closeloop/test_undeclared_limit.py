@@ -8,7 +8,7 @@ import pytest
 from radiotwin.closeloop.crossfit import LogDistanceBase, cross_validate, make_folds
 from radiotwin.closeloop.output.result_file import errors
 from radiotwin.links import prepare_links
-from radiotwin.links.limits import limits_to_explain
+from radiotwin.links.limits import with_usual_limits
 from radiotwin.links.measurements import Measurements
 
 LIMIT_DBM, DEFAULT_DBM, LINKS = -140.0, -120.0, 2000
@@ -35,7 +35,7 @@ def walked(seed, scene):
 
 def held_out(links):
     """Return errors of links in blocks that the law was not fitted to."""
-    links = limits_to_explain(links)
+    links = with_usual_limits(links)
     folds = make_folds(links, 0, "block")
     model = cross_validate(links, LogDistanceBase(None, 0), folds)
     return errors(links.level_db, model.held_out_mean_db)

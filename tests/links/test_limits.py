@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from radiotwin.links.limits import estimate_limits, limits_to_explain
+from radiotwin.links.limits import estimate_limits, with_usual_limits
 from tests.worlds import synthetic_links
 
 DEVICES, REACH_M, STEP_M, SHADOWING_M = 5, 1500.0, 10.0, 50.0
@@ -122,9 +122,9 @@ def test_effects_must_explain_a_deaf_receiver_and_lost_links_only():
     """Three receivers that hardly differ keep their limits; the one that stands out gets the usual one."""
     links = fly(1, (-112.0, -110.0, -111.0, -95.0), n=6000)
     links = links.with_columns(limit_db=estimate_limits(links, None)[0])
-    before_db, after_db = links.receiver_limits_db, limits_to_explain(links).receiver_limits_db
+    before_db, after_db = links.receiver_limits_db, with_usual_limits(links).receiver_limits_db
     np.testing.assert_array_equal(before_db[:3], after_db[:3])
     assert before_db[3] == pytest.approx(-95.0, abs=1.0) and after_db[3] == pytest.approx(-111.0, abs=1.0)
     scattered = fly(2, (-120.0, -113.0, -106.0, -99.0), n=6000)
     scattered = scattered.with_columns(limit_db=estimate_limits(scattered, None)[0])
-    np.testing.assert_array_equal(scattered.limit_db, limits_to_explain(scattered).limit_db)
+    np.testing.assert_array_equal(scattered.limit_db, with_usual_limits(scattered).limit_db)

@@ -11,7 +11,7 @@ import pytest
 from radiotwin.errors import BadInput
 from radiotwin.io import signals as interruption
 from radiotwin.runtime import pieces
-from radiotwin.runtime.pieces import PieceStore, keep_pieces, kept, pieces_folder
+from radiotwin.runtime.pieces import PieceStore, cached, keep_pieces, pieces_folder
 
 
 @pytest.fixture(autouse=True)
@@ -32,8 +32,8 @@ class Work:
             warnings.warn(self.message)
         return self.value
 
-    def kept(self, *inputs):
-        return kept("work", inputs, self, lambda value: ({"value": value}, {"size": len(value)}), self.read)
+    def cached(self, *inputs):
+        return cached("work", inputs, self, lambda value: ({"value": value}, {"size": len(value)}), self.read)
 
     def read(self, arrays, content):
         if content["size"] != len(arrays["value"]):
@@ -45,7 +45,7 @@ def test_a_part_is_made_once_and_comes_back_to_the_bit():
     work = Work()
     for expected in (0, 1):
         with keep_pieces() as store:
-            assert work.kept(1, "a").tobytes() == work.value.tobytes()
+            assert work.cached(1, "a").tobytes() == work.value.tobytes()
         assert store.earlier == expected and store.made == 1 - expected
     assert work.calls == 1
     assert store.progress == "1 of 1 parts were kept from an earlier run"
@@ -55,43 +55,43 @@ def test_other_inputs_are_another_part():
     work = Work()
     with keep_pieces():
         for inputs in ((1,), (2,), (1, 2), ("1",)):
-            work.kept(*inputs)
+            work.cached(*inputs)
     assert work.calls == 4
 
 
 def test_other_code_or_libraries_make_another_part(monkeypatch):
     work = Work()
     with keep_pieces():
-        work.kept(1)
+        work.cached(1)
         monkeypatch.setattr(pieces, "versions", lambda: ("changed",))
-        work.kept(1)
+        work.cached(1)
     assert work.calls == 2
 
 
 def test_nothing_is_kept_where_nobody_asks_for_it(own_cache):
     work = Work()
-    work.kept(1), work.kept(1)
+    work.cached(1), work.cached(1)
     assert work.calls == 2 and not own_cache.exists()
 
 
 def test_inputs_of_unknown_content_are_not_kept():
     work = Work()
     with keep_pieces() as store:
-        work.kept(object()), work.kept(object())
+        work.cached(object()), work.cached(object())
     assert work.calls == 2 and not store.files()
 
 
 def test_a_part_of_this_run_is_not_one_of_an_earlier_run():
     work = Work()
     with keep_pieces() as store:
-        work.kept(1), work.kept(1)
+        work.cached(1), work.cached(1)
     assert work.calls == 1 and store.progress == ""
 
 
 def test_quick_parts_are_not_written(monkeypatch):
     monkeypatch.setattr(pieces, "MIN_SECONDS", 5.0)
     with keep_pieces() as store:
-        Work().kept(1)
+        Work().cached(1)
     assert store.made == 1 and not store.files()
 
 
@@ -102,13 +102,13 @@ def test_quick_parts_are_not_written(monkeypatch):
 def test_a_damaged_part_is_made_again(spoil):
     work = Work()
     with keep_pieces() as store:
-        work.kept(1)
+        work.cached(1)
     ((_, _, path),) = store.files()
     whole = path.read_bytes()
     path.write_bytes(spoil(whole))
     for calls in (2, 2):
         with keep_pieces():
-            assert work.kept(1).tobytes() == work.value.tobytes()
+            assert work.cached(1).tobytes() == work.value.tobytes()
         assert work.calls == calls and path.read_bytes() == whole
 
 
@@ -132,7 +132,7 @@ def test_warnings_come_again_with_the_part():
     work = Work(message="only 3 links")
     for _ in range(2):
         with keep_pieces(), pytest.warns(UserWarning, match="only 3 links") as caught:
-            work.kept(1), work.kept(1)
+            work.cached(1), work.cached(1)
         assert len(caught) == 1
 
 
@@ -140,7 +140,7 @@ def test_an_error_is_not_kept():
     def fail():
         raise BadInput("nothing detected")
     with keep_pieces() as store, pytest.raises(BadInput, match="nothing detected"):
-        kept("work", (1,), fail, lambda value: ({}, None), lambda arrays, content: None)
+        cached("work", (1,), fail, lambda value: ({}, None), lambda arrays, content: None)
     assert not store.files()
 
 
@@ -148,8 +148,8 @@ def test_a_folder_that_cannot_be_written_is_one_warning(own_cache):
     own_cache.write_text("a file")
     work = Work()
     with keep_pieces(), pytest.warns(UserWarning, match="finished parts are not kept: cannot write") as caught:
-        assert work.kept(1) is work.value
-        assert work.kept(2) is work.value
+        assert work.cached(1) is work.value
+        assert work.cached(2) is work.value
     assert len(caught) == 1
 
 
@@ -158,11 +158,11 @@ def test_the_oldest_parts_give_way(monkeypatch):
     work = Work(np.zeros(2500))
     with keep_pieces() as store:
         for number in range(20):
-            work.kept(number)
+            work.cached(number)
             assert sum(size for _, size, _ in store.files()) <= 100_000
     assert 2 <= len(store.files()) < 5
     with keep_pieces() as store:
-        work.kept(19)
+        work.cached(19)
     assert store.earlier == 1
 
 
@@ -215,8 +215,8 @@ def test_the_message_after_an_interruption_is_true(monkeypatch):
     monkeypatch.setattr(interruption, "_finished", 0)
     assert interruption.after_interrupt() == "nothing is kept; run the same command again"
     with keep_pieces():
-        Work().kept(1)
+        Work().cached(1)
     assert interruption.after_interrupt() == "1 finished part is kept; run the same command again to go on"
     with keep_pieces():
-        Work().kept(1)
+        Work().cached(1)
     assert interruption.after_interrupt().startswith("2 finished parts are kept")

@@ -133,7 +133,7 @@ def make_report(loop: Loop) -> dict[str, Any]:
     return _for_json({
         "schema": SCHEMA, "radiotwin_version": __version__, "base": loop.base,
         "verdict": loop.verdict, "effects": effects, "candidates": candidates,
-        "anomalies": [_anomaly(each) | {"same_over": same_over(each, loop.before)}
+        "anomalies": [_anomaly(each) | {"same_over": constant_over(each, loop.before)}
                       for each in loop.found.anomalies],
         "posterior": [_step(each) for each in loop.found.steps],
         "detectable": [vars(each) for each in consistent_sizes(
@@ -275,7 +275,7 @@ def _anomaly(found: Anomaly) -> dict[str, Any]:
                        for name, probability in found.causes.items()]}
 
 
-def same_over(found: Anomaly, base: CrossFit) -> list[str]:
+def constant_over(found: Anomaly, base: CrossFit) -> list[str]:
     """Return whether the level of a device or receiver deviates in all flights and directions.
 
     In each flight (or octant of azimuth) it must differ from the other links by at least half of

@@ -19,7 +19,7 @@ from radiotwin.propagation.laws.kriging import RegressionKriging
 from radiotwin.propagation.laws.log_distance import LogDistance, SegmentedLogDistance
 from radiotwin.propagation.laws.published import PublishedLaw
 from radiotwin.propagation.laws.registry import BUILT_IN, fit_once
-from radiotwin.runtime.pieces import kept
+from radiotwin.runtime.pieces import cached
 from radiotwin.twin.model.model import FittedModel
 
 LAWS: tuple[type[ChannelModel], ...] = (LogDistance, SegmentedLogDistance, RegressionKriging)
@@ -117,8 +117,8 @@ def trees_db(kind: str, part: Part, train: np.ndarray, test: np.ndarray, seed: i
         return forest.predict(part.features[test])
 
     inputs = kind, part.features[rows], part.links.level_db[rows], part.features[test], seed, TREES
-    return kept("trees", inputs, grow, lambda found: ({"mean_db": found}, None),
-                lambda arrays, _: arrays["mean_db"])
+    return cached("trees", inputs, grow, lambda found: ({"mean_db": found}, None),
+                  lambda arrays, _: arrays["mean_db"])
 
 
 def fitted_law(kind: type[ChannelModel], links: Links, train: np.ndarray,

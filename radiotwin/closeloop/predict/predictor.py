@@ -111,13 +111,13 @@ def combined_prediction(model: CrossFit, with_rest: bool, seed: int) -> Combined
     with warnings.catch_warnings():  # threads interleave their changes of the filters
         folds = in_threads(of_fold, range(len(model.folds)))
     held_out = HeldOut.join([each for _, each in folds])
-    away = _hold_out_quadrants(model, folds[-1][0], parts[-1], names, seed)
-    half_m, dof = half_distance_m(held_out, away), model.whole.model.dof
+    quadrants = _hold_out_quadrants(model, folds[-1][0], parts[-1], names, seed)
+    half_m, dof = half_distance_m(held_out, quadrants), model.whole.model.dof
 
     reading_db, map_db, rank = np.full((3, len(links)), np.nan)
     for number, (learnt, _) in enumerate(folds):
         weights = combination(held_out.select(held_out.fold != number),
-                              away.select(away.fold != number), names, half_m, dof)
+                              quadrants.select(quadrants.fold != number), names, half_m, dof)
         fold = model.folds[number]
         test = np.flatnonzero((model.index == number) & fold.usable)
         learnt = _combined(learnt, fold, weights)
@@ -125,7 +125,7 @@ def combined_prediction(model: CrossFit, with_rest: bool, seed: int) -> Combined
         reading_db[test], rank[test] = law.reading_db, law.rank(links.level_db[test])
         map_db[test] = learnt.law_on(fold.for_map(test)).mean_db
     return CombinedPrediction(reading_db, map_db, rank,
-                              combination(held_out, away, names, half_m, dof), baselines)
+                              combination(held_out, quadrants, names, half_m, dof), baselines)
 
 
 def combined_fit(model: CrossFit, found: Combination, seed: int) -> FittedModel:

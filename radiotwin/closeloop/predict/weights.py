@@ -89,50 +89,50 @@ class Combination:
     sd_ratio: tuple[float, float]
 
 
-def half_distance_m(held_out: HeldOut, away: HeldOut) -> float:
+def half_distance_m(held_out: HeldOut, quadrants: HeldOut) -> float:
     """Return the distance from measurements at which near and far weights count equally [m].
 
     It is the geometric mean of both sets' median distances, so it scales with the campaign.
     """
     medians_m = [np.median(each.away_m[np.isfinite(each.away_m)])
-                 for each in (held_out, away) if np.isfinite(each.away_m).any()]
+                 for each in (held_out, quadrants) if np.isfinite(each.away_m).any()]
     if len(medians_m) < 2:
         return HALF_M
     return float(np.sqrt(np.prod(np.maximum(medians_m, 1.0))))
 
 
-def combination(held_out: HeldOut, away: HeldOut, names: list[str], half_m: float,
+def combination(held_out: HeldOut, quadrants: HeldOut, names: list[str], half_m: float,
                 dof: float) -> Combination:
     """Fit the weights with the least squared error of readings, and the error scale.
 
     Args:
         held_out: links of held-out folds.
-        away: links of held-out quadrants.
+        quadrants: links of held-out quadrants.
         names: names of the k members.
         half_m: `half_distance_m` of both sets [m].
         dof: degrees of freedom of the Student-t errors.
     """
-    held_out, away = (each.select(np.isfinite(each.members_db).all(axis=1))
-                      for each in (held_out, away))
+    held_out, quadrants = (each.select(np.isfinite(each.members_db).all(axis=1))
+                           for each in (held_out, quadrants))
     if not np.isfinite(held_out.level_db).any():  # nothing could be held out
         return Combination({NAMED: (1.0, 1.0)}, half_m, (1.0, 1.0))
     sd_ratio = 1.0, 1.0
     for _ in range(PASSES):
-        weights = _weights(held_out, away, half_m, sd_ratio, dof)
-        sd_ratio = _sd_ratio(held_out, away, weights, half_m, dof)
+        weights = _weights(held_out, quadrants, half_m, sd_ratio, dof)
+        sd_ratio = _sd_ratio(held_out, quadrants, weights, half_m, dof)
     return Combination({name: (float(near), float(far)) for name, (near, far) in
                         zip(names, weights.T, strict=True) if near or far}, half_m, sd_ratio)
 
 
-def _weights(held_out: HeldOut, away: HeldOut, half_m: float, sd_ratio: tuple[float, float],
+def _weights(held_out: HeldOut, quadrants: HeldOut, half_m: float, sd_ratio: tuple[float, float],
              dof: float) -> np.ndarray:
     """Fit weights (2, k) of k members, near and far, by least squared error of readings.
 
-    Quadrants (`away`) count less, until unseen folds are predicted nearly as well (`AS_GOOD`) as by
-    the best member; otherwise this member gets all weight. Weights below `MIN_WEIGHT` become 0.
+    `quadrants` count less, until unseen folds are predicted nearly as well (`AS_GOOD`) as by the
+    best member; otherwise this member gets all weight. Weights below `MIN_WEIGHT` become 0.
     """
     sets = []
-    for links in (held_out, away):
+    for links in (held_out, quadrants):
         links = links.select(np.isfinite(links.level_db))
         share = far_share(links.away_m, half_m)
         factor = sd_factor(share, sd_ratio)
@@ -141,15 +141,15 @@ def _weights(held_out: HeldOut, away: HeldOut, half_m: float, sd_ratio: tuple[fl
              for mean_db, scale_db in zip(links.members_db.T, links.scales_db.T, strict=True)])
         best_db = np.sqrt(np.square(error_db).mean(axis=0).min()) if len(links) else 1.0
         sets.append((error_db / max(best_db, 1e-6), share, links.fold))
-    (error, share, fold), (error_away, share_away, fold_away) = sets
+    (error, share, fold), (error_quadrants, share_quadrants, fold_quadrants) = sets
 
     def fitted(count: float, left_out: int = -1) -> np.ndarray:
         """Return weights if quadrants count `count` times; the fold `left_out` is not used."""
-        near, far = fold != left_out, fold_away != left_out
+        near, far = fold != left_out, fold_quadrants != left_out
         # Scale errors so that both sets count by their mean square, not by their number of links.
         factor = np.sqrt(count * near.sum() / max(far.sum(), 1))
-        found = convex_weights(np.vstack([error[near], factor * error_away[far]]),
-                               np.concatenate([share[near], share_away[far]]), PULL)
+        found = convex_weights(np.vstack([error[near], factor * error_quadrants[far]]),
+                               np.concatenate([share[near], share_quadrants[far]]), PULL)
         found[:, found.max(axis=0) < MIN_WEIGHT] = 0.0
         return found / found.sum(axis=1, keepdims=True)
 
@@ -165,13 +165,13 @@ def _weights(held_out: HeldOut, away: HeldOut, half_m: float, sd_ratio: tuple[fl
     return np.tile(np.arange(error.shape[1]) == best, (2, 1)).astype(float)
 
 
-def _sd_ratio(held_out: HeldOut, away: HeldOut, weights: np.ndarray, half_m: float,
+def _sd_ratio(held_out: HeldOut, quadrants: HeldOut, weights: np.ndarray, half_m: float,
               dof: float) -> tuple[float, float]:
     """Fit the error scale of the combination over that of its members, near and far, by likelihood.
 
-    Quadrants (`away`) are used, too, as errors far from measurements show only in them.
+    `quadrants` are used, too, as errors far from measurements show only in them.
     """
-    links = HeldOut.join([held_out, away])
+    links = HeldOut.join([held_out, quadrants])
     links = links.select(np.arange(0, len(links), max(len(links) // SD_LINKS, 1)))
     share = far_share(links.away_m, half_m)
     mean_db, scale_db = blended(links.members_db, links.scales_db, share, weights, (1.0, 1.0))

@@ -17,7 +17,11 @@ from scipy.special import softmax
 
 from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.closeloop.scan import Anomaly, scan
-from radiotwin.closeloop.search.faults import judge_in_other_folds, with_fault, within_flights
+from radiotwin.closeloop.search.faults import (
+    score_with_fixed_parameters,
+    with_fault,
+    within_flights,
+)
 from radiotwin.closeloop.search.scoring import (
     Candidate,
     fit_candidate,
@@ -69,7 +73,7 @@ def _with_cause(state: SearchState, anomaly: Anomaly, inputs: SearchInputs
     model, criteria = state.model, inputs.criteria
     ends = [name for names in anomaly.members.values() for name in names]
     inputs.on_progress("causes of what " + (" × ".join(ends) or f"one {anomaly.family}") + " reads")
-    state, hypotheses = state.look(inputs.seed)
+    state, hypotheses = state.with_hypotheses(inputs.seed)
     group = anomaly.rows[model.whole.train]
     if not group.any():
         return state, {}
@@ -129,7 +133,7 @@ def _judge_cause(model: CrossFit, candidate: Candidate, others: Sequence[float],
     changes = inputs.folds.by == "flight" and effect.between_flights() is not None
     if not (effect.within_flights or changes):
         return score_and_judge(model, candidate, others, hypotheses, inputs)
-    trial, extended = judge_in_other_folds(
+    trial, extended = score_with_fixed_parameters(
         within_flights(model, inputs, "block" if changes else ""), candidate, others, hypotheses,
         inputs)
     if extended is None:

@@ -97,7 +97,7 @@ def _one_step(state: SearchState, available: list[Effect], causes: bool,
     hypotheses = None
     if causes:
         inputs.on_progress(f"step {state.step + 1}: what the base may be wrong in")
-        state, hypotheses = state.look(inputs.seed)
+        state, hypotheses = state.with_hypotheses(inputs.seed)
     tried = _try_all(state, available, hypotheses, inputs)
     if hypotheses is not None:
         state, tried = _judge_step(state, tried, hypotheses, inputs.criteria)
@@ -293,7 +293,7 @@ def _keep_best(state: SearchState, tried: list[Tried], hypotheses: Hypotheses | 
                    else _devices_on_one_mast(first.model))
     if rival is not None and max_repeats > 1:
         inputs.on_progress(f"step {step + 1}: more of {rival.trial.name}")
-        repeats = _repeat(rival, hypotheses, first_nats, max_repeats, inputs)
+        repeats = _add_repeats(rival, hypotheses, first_nats, max_repeats, inputs)
         if repeats and rival.trial.reason:
             repeats = _if_more_probable(state, repeats, first.trial, criteria)
         kept = repeats or kept
@@ -345,8 +345,8 @@ def _devices_on_one_mast(model: CrossFit) -> int:
     return len(devices) if on_mast else 0
 
 
-def _repeat(rival: Tried, hypotheses: Hypotheses | None, min_nats: float, max_repeats: int,
-            inputs: SearchInputs) -> list[Tried]:
+def _add_repeats(rival: Tried, hypotheses: Hypotheses | None, min_nats: float, max_repeats: int,
+                 inputs: SearchInputs) -> list[Tried]:
     """Add an effect of one kind again until all repeats together have more than `min_nats`.
 
     Examples: groves, each seen from few devices, instead of an offset of each device; antennas

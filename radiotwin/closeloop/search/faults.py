@@ -58,14 +58,14 @@ def _add_changes_of(state: SearchState, effect: Effect, inputs: SearchInputs) ->
     """Add changes of one effect between flights, scored on held-out ground, until none passes."""
     model = None
     while not state.is_full(inputs.criteria):
-        state, hypotheses = state.look(inputs.seed)
+        state, hypotheses = state.with_hypotheses(inputs.seed)
         candidate = fit_candidate(state.model, effect, inputs.criteria, hypotheses)
         if isinstance(candidate, Trial):
             return state
         inputs.on_progress(f"{effect.name}, held out by block")
         if model is None:
             model = within_flights(state.model, inputs, "block")
-        trial, extended = judge_in_other_folds(model, candidate, [], hypotheses, inputs)
+        trial, extended = score_with_fixed_parameters(model, candidate, [], hypotheses, inputs)
         if extended is None:
             return state.refuse(trial)
         model = extended
@@ -74,9 +74,9 @@ def _add_changes_of(state: SearchState, effect: Effect, inputs: SearchInputs) ->
     return state
 
 
-def judge_in_other_folds(model: CrossFit, candidate: Candidate, others: Sequence[float],
-                     hypotheses: Hypotheses, inputs: SearchInputs
-                     ) -> tuple[Trial, CrossFit | None]:
+def score_with_fixed_parameters(model: CrossFit, candidate: Candidate, others: Sequence[float],
+                                hypotheses: Hypotheses, inputs: SearchInputs
+                                ) -> tuple[Trial, CrossFit | None]:
     """Score a candidate by other folds than those of the search, such as parts of flights.
 
     `model` has these folds. The candidate's parameters were fitted to all links, and are kept.
@@ -97,7 +97,7 @@ def add_faults(state: SearchState, inputs: SearchInputs) -> SearchState:
     criteria, model = inputs.criteria, None
     while timed and not state.is_full(criteria):
         step = state.step
-        state, hypotheses = state.look(inputs.seed)
+        state, hypotheses = state.with_hypotheses(inputs.seed)
         fitted = [fit_candidate(state.model, effect, criteria, hypotheses) for effect in timed]
         fitted = _refuse_lasting(fitted, state, inputs)
         candidates = [each for each in fitted if isinstance(each, Candidate)]
@@ -106,7 +106,7 @@ def add_faults(state: SearchState, inputs: SearchInputs) -> SearchState:
             inputs.on_progress(f"step {step + 1}: {candidate.effect.name}, held out within flights")
             if model is None:
                 model = within_flights(state.model, inputs)
-            trial, extended = judge_in_other_folds(model, candidate, [], hypotheses, inputs)
+            trial, extended = score_with_fixed_parameters(model, candidate, [], hypotheses, inputs)
             if extended is not None:
                 model = extended
                 state = state.keep(trial, with_fault(state.model, candidate))
@@ -174,7 +174,7 @@ def drop_idle_faults(state: SearchState, inputs: SearchInputs) -> SearchState:
             continue
         others = _without(whole.model, number).fit()
         gain = others.objective - whole.objective
-        is_found = _is_cause_of_anomaly(state, number) or _is_found(whole, number, others)
+        is_found = _is_cause_of_anomaly(state, number) or _is_proposed_again(whole, number, others)
         if gain >= inputs.criteria.min_training_gain_nats and is_found:
             continue
         folds = [_without(each.model, match_effects(whole, each)[number]).fit()
@@ -193,7 +193,7 @@ def _is_cause_of_anomaly(state: SearchState, number: int) -> bool:
                for each in state.anomalies if each.causes)
 
 
-def _is_found(fit: Fit, number: int, without: Fit) -> bool:
+def _is_proposed_again(fit: Fit, number: int, without: Fit) -> bool:
     """Return whether the search for an effect finds it again in a fit without it (`without`).
 
     A proposal is the same fault if at least the share `MIN_SHARED` of all links on which either

@@ -205,7 +205,7 @@ def score_model(model: CrossFit, extended: CrossFit, trial: Trial, criteria: Sel
     """
     gain = model.held_out_nll - extended.held_out_nll
     known = np.isfinite(gain)
-    usable = known & ~model.unforeseen
+    usable = known & ~model.not_learnable
     if not usable.any():
         return replace(trial, reason="no held-out link can be judged with it")
     total = float(gain[usable].sum())

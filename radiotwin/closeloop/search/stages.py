@@ -55,7 +55,7 @@ class SearchState:
         log: trials. Of faults only the refused ones of the last round are logged, of effects that
             were tried together only the kept ones.
         steps: summary of the residual before each named effect, and of the final one.
-        looked_at: the latest model with hypotheses, and these.
+        last_hypotheses: the latest model with hypotheses, and these.
         anomalies: groups of links that stand out in the residual of the base, with their causes.
         notes: sentences about declared effects.
     """
@@ -63,7 +63,7 @@ class SearchState:
     model: CrossFit
     log: TrialLog = field(default_factory=TrialLog)
     steps: tuple[Step, ...] = ()
-    looked_at: tuple[CrossFit, Hypotheses] | None = None
+    last_hypotheses: tuple[CrossFit, Hypotheses] | None = None
     anomalies: tuple[Anomaly, ...] = ()
     notes: tuple[str, ...] = ()
 
@@ -76,12 +76,12 @@ class SearchState:
         """Return whether the model has `max_effects` effects."""
         return self.step >= criteria.max_effects
 
-    def look(self, seed: int) -> tuple[SearchState, Hypotheses]:
+    def with_hypotheses(self, seed: int) -> tuple[SearchState, Hypotheses]:
         """Return the state with the evidence for further effects, computed once for each model."""
-        if self.looked_at is not None and self.looked_at[0] is self.model:
-            return self, self.looked_at[1]
+        if self.last_hypotheses is not None and self.last_hypotheses[0] is self.model:
+            return self, self.last_hypotheses[1]
         found = Hypotheses.of(self.model.whole, seed)
-        return replace(self, looked_at=(self.model, found)), found
+        return replace(self, last_hypotheses=(self.model, found)), found
 
     def keep(self, trial: Trial, model: CrossFit) -> SearchState:
         """Return the state with one more effect in its model, and the trial logged as kept."""

@@ -96,7 +96,7 @@ class Hypotheses:
                    fit.coefficients, near)
 
     @cached_property
-    def _rotated(self) -> tuple[np.ndarray, float, np.ndarray]:
+    def _decorrelated_nuisance(self) -> tuple[np.ndarray, float, np.ndarray]:
         """Decorrelated nuisance columns; log likelihood and log variances without a further effect.
 
         The (2,) variances are those of noise and of the field that is correlated over positions.
@@ -109,7 +109,7 @@ class Hypotheses:
     @property
     def rest_and_noise_db(self) -> tuple[float, float]:
         """Standard deviations of the place-bound residual and of noise [dB]."""
-        _, _, theta = self._rotated
+        _, _, theta = self._decorrelated_nuisance
         noise_db = np.exp(0.5 * theta[0]) * float(np.median(self.scale_db))
         return noise_db * np.exp(0.5 * theta[1]), noise_db
 
@@ -123,7 +123,7 @@ class Hypotheses:
             widening: (n,) factor by which the effect widens the error scales, by which `z` and
                 `columns` are divided; None: 1.
         """
-        nuisance, base, theta = self._rotated
+        nuisance, base, theta = self._decorrelated_nuisance
         if widening is not None:
             nuisance = self.evidence.rotated(self.nuisance.values / widening[:, None])
             widened = np.log(widening[self.evidence.rows])
@@ -134,7 +134,7 @@ class Hypotheses:
 
     def information(self, pattern_db: np.ndarray) -> float:
         """Return the Fisher information on the size of a pattern (n,) of unit size [1/size²]."""
-        columns, _, theta = self._rotated
+        columns, _, theta = self._decorrelated_nuisance
         pattern = self.evidence.rotated(pattern_db / self.scale_db)
         return self.evidence.information(pattern, columns, self.nuisance.prior_sd, theta)
 

@@ -10,7 +10,7 @@ from radiotwin.closeloop.verdict.criteria import SelectionCriteria
 from radiotwin.inference.dependence import Series, holm, levels_of, permutation_p_value
 from radiotwin.links import Links, residual_variables
 from radiotwin.links.sites import repeats_at_places, shared_names
-from radiotwin.runtime.pieces import kept
+from radiotwin.runtime.pieces import cached
 
 MAX_LINKS = 20_000  # of more links, whole series are sampled
 MAX_Z = 4.0  # residuals are clipped to this many scales
@@ -38,10 +38,10 @@ def dependences(model: CrossFit, seed: int) -> list[ResidualDependence]:
     draws the permutations of the tests.
     """
     mean_db = model.held_out_mean_db
-    residual_db = np.where(model.unforeseen, np.nan, model.links.level_db - mean_db)
+    residual_db = np.where(model.not_learnable, np.nan, model.links.level_db - mean_db)
     inputs = model.links, residual_db, model.held_out_reading[1], mean_db, seed
-    return kept("dependences", inputs, lambda: _tested(*inputs),
-                lambda found: ({}, [asdict(each) for each in found]), _read)
+    return cached("dependences", inputs, lambda: _tested(*inputs),
+                  lambda found: ({}, [asdict(each) for each in found]), _read)
 
 
 def significant(dependences: list[ResidualDependence],

@@ -26,7 +26,7 @@ from radiotwin.propagation.paths.powers import (
 )
 from radiotwin.runtime.compiled import njit
 from radiotwin.runtime.console import progress
-from radiotwin.runtime.pieces import KeptParts, Piece
+from radiotwin.runtime.pieces import Piece, ResultCache
 from radiotwin.runtime.processes import in_threads
 from radiotwin.scene.citymap import CityMap
 
@@ -316,7 +316,7 @@ def _new_paths(city: CityMap, asked: list[tuple[_Position, np.ndarray]],
             raise ValueError("wrong shapes, or links that do not ascend")
         return powers, paths
 
-    parts: KeptParts[int, _NewPaths] = KeptParts(
+    parts: ResultCache[int, _NewPaths] = ResultCache(
         "paths", lambda number: (city, *asked[number], frequency_hz), write, read)
     found = {}
     for number, (_, ends_m) in enumerate(asked):

@@ -30,7 +30,7 @@ from radiotwin.propagation.laws.log_distance import LogDistance, SegmentedLogDis
 from radiotwin.propagation.laws.path_kriging import PathKriging
 from radiotwin.propagation.laws.published import P1411, WalfischIkegami, WalfischIkegamiMetropolitan
 from radiotwin.propagation.laws.segmented_nn import SegmentedNN
-from radiotwin.runtime.pieces import kept
+from radiotwin.runtime.pieces import cached
 from radiotwin.runtime.plugins import load_plugins
 
 ENTRY_POINTS = "radiotwin.channels"  # entry-point group
@@ -90,8 +90,8 @@ def fit_once(kind: type[ChannelModel], links: LinkGeometry, level_db: np.ndarray
 
     The other arguments, and errors, are those of `ChannelModel.fit`.
     """
-    return kept("channel", (kind, links, level_db, limit_db, seed),
-                lambda: kind().fit(links, level_db, limit_db, seed), kind.state, kind.from_state)
+    return cached("channel", (kind, links, level_db, limit_db, seed),
+                  lambda: kind().fit(links, level_db, limit_db, seed), kind.state, kind.from_state)
 
 
 def encode_channel(model: ChannelModel, beside: dict[str, np.ndarray] | None = None) -> bytes:

@@ -30,7 +30,7 @@ from radiotwin.propagation.paths.images import Candidates
 from radiotwin.propagation.paths.powers import PathPowers, path_powers
 from radiotwin.runtime.console import progress
 from radiotwin.runtime.execution import Executor, Job, Resources
-from radiotwin.runtime.pieces import KeptParts, Piece, keeps, kept_with_name
+from radiotwin.runtime.pieces import Piece, ResultCache, cached_with_name, keeps
 from radiotwin.runtime.processes import in_threads
 from radiotwin.scene.citymap import CityMap
 from radiotwin.twin.localize.estimate import CREDIBLE, TwinDevice
@@ -157,8 +157,8 @@ class Relocation:
         if not self.executor.is_worth_it or not keeps() or len(searches) < 2:
             return
         inputs: list[tuple] = []
-        parts: KeptParts[int, Piece] = KeptParts("position", inputs.__getitem__,
-                                                 lambda found: found, lambda *piece: piece)
+        parts: ResultCache[int, Piece] = ResultCache("position", inputs.__getitem__,
+                                                     lambda found: found, lambda *piece: piece)
         history = self.history
         for search, device, before in searches:
             inputs.append((history, self.bounds, search.by_law, search.by_paths, device, before))
@@ -189,7 +189,7 @@ class Relocation:
             return found
 
         inputs = self.history, self.bounds, search.by_law, search.by_paths, device, before
-        found, self.history = kept_with_name(
+        found, self.history = cached_with_name(
             "position", inputs, partial(search.from_law, device, before), write, read)
         return found
 

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from radiotwin.links import Links
 from radiotwin.links.sites import antenna_of, relatives_of
 from radiotwin.propagation.laws.kriging import MIN_POINTS, ResidualField
-from radiotwin.runtime.pieces import kept
+from radiotwin.runtime.pieces import cached
 
 MIN_SD = 1e-6  # least standard deviation of residuals, against division by zero
 LEAST_SHARED_SD = 0.1  # prior sd of relatives' residuals [error scales], shrinks their slope
@@ -51,8 +51,8 @@ class RelativesState(FieldState):
 
 def _fitted_field(what: str, field: ResidualField, *points: Any) -> ResidualField:
     """Fit an empty field to points (`ResidualField.fit`), or load the result of an earlier run."""
-    return kept(what, points, lambda: field.fit(*points), ResidualField.state,
-                ResidualField.from_state)
+    return cached(what, points, lambda: field.fit(*points), ResidualField.state,
+                  ResidualField.from_state)
 
 
 def written_field(field: ResidualField) -> dict[str, Any]:

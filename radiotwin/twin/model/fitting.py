@@ -20,7 +20,7 @@ from radiotwin.inference import censored_regression
 from radiotwin.links import Links
 from radiotwin.propagation.laws.base import ANY_LEVEL_SD_DB
 from radiotwin.runtime.execution import Executor, Job, Resources
-from radiotwin.runtime.pieces import KeptParts, Piece, keeps, kept
+from radiotwin.runtime.pieces import Piece, ResultCache, cached, keeps
 from radiotwin.runtime.processes import resident_bytes
 from radiotwin.twin.model.model import Fit, Model, response
 
@@ -195,8 +195,8 @@ def add_effect(fit: Fit, effect: Effect, like: Effect | None = None,
         the fit with the effect; None if the effect proposes no parameters for these residuals.
     """
     inputs = (fit, effect, like) if group is None else (fit, effect, like, group)
-    return kept("effect", inputs, lambda: _best_addition(fit, effect, like, group),
-                _write_addition, _reader(fit.model, effect))
+    return cached("effect", inputs, lambda: _best_addition(fit, effect, like, group),
+                  _write_addition, _reader(fit.model, effect))
 
 
 def along_paths(fit: Fit, without: Fit) -> Fit:
@@ -214,8 +214,8 @@ def along_paths(fit: Fit, without: Fit) -> Fit:
     changes_few = np.count_nonzero(fit.model.terms[-1].offset_db) <= MAX_FOLLOWED_LINKS
     if not effect.always_exact or gain_nats < MIN_GAIN_NATS or not changes_few:
         return fit
-    found = kept("effect-along-paths", (fit, without), lambda: _best_along_paths(fit, without),
-                 _write_addition, _reader(fit.model.with_effects(fit.effects[:-1]), effect))
+    found = cached("effect-along-paths", (fit, without), lambda: _best_along_paths(fit, without),
+                   _write_addition, _reader(fit.model.with_effects(fit.effects[:-1]), effect))
     return found or fit
 
 
@@ -235,7 +235,7 @@ def prepare_additions(without: Sequence[Fit], effects: Sequence[Effect], executo
     if not executor.is_worth_it or not keeps():
         return
     pieces = [(fit, effect) for fit in range(len(without)) for effect in range(len(effects))]
-    parts: KeptParts[tuple[int, int], Piece | None] = KeptParts(
+    parts: ResultCache[tuple[int, int], Piece | None] = ResultCache(
         "effect", lambda piece: (without[piece[0]], effects[piece[1]], like),
         lambda found: found, lambda arrays, content: (arrays, content))
     function = partial(_added, list(without), list(effects), like)
