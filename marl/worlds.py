@@ -12,7 +12,7 @@ from radiotwin.maps.radiomap import RadioMap
 from radiotwin.scene import Scene
 from radiotwin.scene.config import ANTENNA_HEIGHT_M
 from radiotwin.twin import Twin
-from radiotwin.twin.shadowing import MapErrors
+from radiotwin.twin.shadowing import ErrorCorrelation
 
 CANDIDATES, CANDIDATES_ALONG_PATHS = 120, 12  # positions of a device; paths take seconds for each
 MAX_VALUES = 2e8  # largest number of values in the candidates' maps: 1.6 GB
@@ -32,7 +32,7 @@ def twin_prior(twin: Twin, scene: Scene, radio_map: RadioMap, rng: np.random.Gen
         silent: probability that a device does not transmit.
         data_spread: relative half-width of each device's data, see `Prior`.
     """
-    errors = MapErrors.kept(twin)
+    errors = ErrorCorrelation.from_provenance(twin)
     levels = np.unique(levels_of(scene))
     lattice = scene.lattice
     receiver_m = lattice.positions_m.reshape(*lattice.shape, 3)[levels].reshape(-1, 3)

@@ -96,7 +96,7 @@ def _print_twin(twin: "Twin", title: str) -> None:
                    {"links": "left", "parameter": "left", "value": "right", "low": "right",
                     "high": "right", "unit": "left"}, law.to_numpy(dtype=object).tolist())
     model, located_by = twin.channel.name, twin.provenance.get(LOCATED_BY, "")
-    held_out = HeldOut.kept(twin.provenance)
+    held_out = HeldOut.from_provenance(twin.provenance)
     say(f"{model} was not compared with others: too few links of anchors to hold any out"
         if held_out is None else held_out.sentence(model))
     if located_by not in ("", model):

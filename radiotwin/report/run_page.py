@@ -93,7 +93,8 @@ def _channel_words(run: Run) -> str:
 
     It is empty for a close-loop, whose page has errors of its own.
     """
-    held_out = HeldOut.kept(run.twin.provenance) if run.twin and not run.closeloop else None
+    held_out = HeldOut.from_provenance(run.twin.provenance) \
+        if run.twin and not run.closeloop else None
     if held_out is None or run.twin is None or run.twin.channel.name not in held_out.rmse_db:
         return ""
     name = run.twin.channel.name

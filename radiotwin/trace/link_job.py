@@ -123,14 +123,14 @@ class PackedCity:
         shapely.prepare(hull)
         return shapely.dwithin(self._boxes, hull, tile.radius_m)
 
-    def part(self, kept: np.ndarray) -> list[CityShape]:
-        """Return the shapes where `kept`, (n,) bool, is True, joined to one shape per material."""
+    def part(self, chosen: np.ndarray) -> list[CityShape]:
+        """Return the shapes where `chosen` (n,) is True, joined to one shape per material."""
         import trimesh
 
         shape = np.repeat(np.arange(len(self)), np.diff(self.first_face))
         part = []
         for row, material in enumerate(self.materials):
-            faces = self.faces[(kept & (self.material == row))[shape]]
+            faces = self.faces[(chosen & (self.material == row))[shape]]
             if len(faces):
                 used, renumbered = np.unique(faces, return_inverse=True)
                 mesh = trimesh.Trimesh(self.vertices_m[used], renumbered.reshape(-1, 3),

@@ -32,7 +32,7 @@ from radiotwin.twin.fit_paths import fit_along_paths, fit_over_wrong_map
 from radiotwin.twin.law import LAW, law_parameters
 from radiotwin.twin.localize import LocalizeSettings
 from radiotwin.twin.selection import AUTO, CHEAP, HELD_OUT, LOCATED_BY, UNTRIED, HeldOut
-from radiotwin.twin.shadowing import MAP_ERRORS, MapErrors
+from radiotwin.twin.shadowing import MAP_ERRORS, ErrorCorrelation
 from radiotwin.twin.twin import Twin
 
 # Most links that are fitted. With 310,000 simulated links, whose errors are independent, the map
@@ -132,7 +132,7 @@ def fit_twin(measurements: Measurements | pd.DataFrame | Path | str, scene: Scen
         twin = fit_links(links, scene, channel, seed, start, settings, locator=locator)
     twin.provenance.update(flights=flights, seed=seed)
     if not along_paths:  # which would be followed once more
-        twin.provenance[MAP_ERRORS] = asdict(MapErrors.of(twin, links, seed))
+        twin.provenance[MAP_ERRORS] = asdict(ErrorCorrelation.of(twin, links, seed))
         twin.provenance[LAW] = law_parameters(twin.channel, *anchors_links(links), seed)
     if held_out is not None:
         twin.provenance[HELD_OUT] = held_out.record

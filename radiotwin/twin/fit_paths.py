@@ -174,7 +174,7 @@ def fit_over_wrong_map(links: Links, scene: Scene, seed: int, start: Twin | None
         start = replace(start, devices=[_moved_device(device, back_m) for device in start.devices])
     by_paths = fit_along_paths(with_copies, scene, seed, start, executor)
     assert isinstance(by_paths.channel, ImagePaths)
-    found = _found(on_map, _calibrated(by_paths.devices, on_map), shift_m, seed)
+    found = _estimate_errors(on_map, _calibrated(by_paths.devices, on_map), shift_m, seed)
     if found[0].warning:
         warnings.warn(f"the 3D map seems to be off: {found[0].warning}; predictions and radii "
                       "include it, and a better map would improve them", stacklevel=3)
@@ -244,7 +244,7 @@ def _calibrated(devices: list[TwinDevice], links: Links) -> list[TwinDevice]:
             for device in devices[:count]]
 
 
-def _found(links: Links, devices: list[TwinDevice], shift_m: Shift, seed: int) -> Found:
+def _estimate_errors(links: Links, devices: list[TwinDevice], shift_m: Shift, seed: int) -> Found:
     """Estimate the map's wall, height and material errors by devices located within LOST_M."""
     known = links.with_located_devices(reliable_m(devices, LOST_M))
     informative = drop_uninformative(*known.gains())

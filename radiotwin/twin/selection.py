@@ -93,7 +93,7 @@ class HeldOut:
                    as_good)
 
     @classmethod
-    def kept(cls, provenance: dict[str, Any]) -> HeldOut | None:
+    def from_provenance(cls, provenance: dict[str, Any]) -> HeldOut | None:
         """Restore the held-out errors from a twin's provenance; None: models were not compared."""
         rows = provenance.get(HELD_OUT)
         if not rows:

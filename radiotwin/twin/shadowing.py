@@ -1,4 +1,4 @@
-"""MapErrors: correlation of a twin's map errors in space, and spread of devices' levels.
+"""ErrorCorrelation: correlation of a twin's map errors in space, and spread of devices' levels.
 
 `sigma_db` of a map is the standard deviation of its errors. If it were drawn anew in every slot of
 a simulated flight, hovering anywhere and waiting for a lucky slot would pay, which no real world
@@ -24,7 +24,7 @@ MIN_SHARE = 0.05  # smaller correlated shares count as 0: drawing them takes as 
 
 
 @dataclass(frozen=True)
-class MapErrors:
+class ErrorCorrelation:
     """Structure of a twin's prediction errors, beside their standard deviation at a link.
 
     Attributes:
@@ -42,7 +42,7 @@ class MapErrors:
     devices: int = 0
 
     @classmethod
-    def of(cls, twin: Twin, links: Links, seed: int) -> "MapErrors":
+    def of(cls, twin: Twin, links: Links, seed: int) -> "ErrorCorrelation":
         """Estimate how prediction errors are correlated in space from the residuals of a twin.
 
         Args:
@@ -63,7 +63,7 @@ class MapErrors:
     @classmethod
     def of_residuals(cls, device: np.ndarray, receiver_m: np.ndarray, residual_db: np.ndarray,
                      sd_db: np.ndarray, seed: int, field: ResidualField | None = None
-                     ) -> "MapErrors":
+                     ) -> "ErrorCorrelation":
         """Estimate the spatial correlation of errors, and the spread of devices' levels.
 
         Args:
@@ -95,8 +95,8 @@ class MapErrors:
                    len(level_db))
 
     @classmethod
-    def kept(cls, twin: Twin) -> "MapErrors":
-        """Return the `MapErrors` stored in a twin's provenance; the defaults if there are none."""
+    def from_provenance(cls, twin: Twin) -> "ErrorCorrelation":
+        """Return what is stored in a twin's provenance; the defaults if there is nothing."""
         return cls(**twin.provenance.get(MAP_ERRORS, {}))
 
 
@@ -126,12 +126,12 @@ def with_shadowing(radio_map: RadioMap, twin: Twin) -> RadioMap:
 
     Args:
         radio_map: `twin.radio_map(scene)`.
-        twin: its residual field gives the correlation, or else its stored `MapErrors`.
+        twin: its residual field gives the correlation, or else its stored `ErrorCorrelation`.
     """
-    errors = twin.residual_field or MapErrors.kept(twin)
+    errors = twin.residual_field or ErrorCorrelation.from_provenance(twin)
     share, length_m = float(errors.share), float(errors.length_m)
     # A correlation within one cell cannot be distinguished from one within one slot.
     if length_m < radio_map.lattice.step_m or share < MIN_SHARE:
-        share, length_m = 0.0, MapErrors.length_m
+        share, length_m = 0.0, ErrorCorrelation.length_m
     return RadioMap(radio_map.dataset.assign_attrs(shadowing_share=share,
                                                    shadowing_length_m=length_m))

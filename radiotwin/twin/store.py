@@ -131,8 +131,8 @@ class ChannelRecord(_Strict):
     file: Literal["channel.safetensors"]
 
 
-class _MapErrors(_Strict):
-    """Content of `MapErrors`."""
+class _ErrorCorrelation(_Strict):
+    """Content of `ErrorCorrelation`."""
 
     share: Annotated[float, Field(ge=0, le=1)]
     length_m: Annotated[float, Field(gt=0, le=MAX_POSITION_M)]
@@ -169,7 +169,7 @@ class _Provenance(BaseModel):
     scene_hash: str | None = None
     origin: Origin | None = None
     receiver_heights_m: Annotated[list[Real], Field(min_length=2, max_length=2)] | None = None
-    map_errors: _MapErrors | None = None
+    map_errors: _ErrorCorrelation | None = None
     held_out: Annotated[list[_HeldOutError], Field(max_length=10)] | None = None
     law: Annotated[list[_LawParameter], Field(max_length=10)] | None = None
 

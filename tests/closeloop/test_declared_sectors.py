@@ -283,7 +283,7 @@ def test_a_held_out_sector_is_predicted_as_the_twin_that_lacks_it_predicts_it():
     kind = make_bases(None, 0)["log-distance"]
     inputs = SearchInputs(links, kind, folds, tuple(effect() for effect in BUILT_IN))
     result = search(SearchState(cross_validate(links, kind, folds)), [add_declared], inputs)
-    shadowing = [fit.rest(0) for fit in result.model.fits]
+    shadowing = [fit.fit_shadowing(0) for fit in result.model.fits]
     model = result.model.map(lambda fit, field: replace(fit, shadowing=field), shadowing)
     mean_db, scale_db = model.held_out_reading
     spread_db, unheard_db = model.held_out_scales

@@ -110,7 +110,7 @@ def test_folds_follow_no_paths_of_their_own_for_intervals(monkeypatch):
     assert 4 <= len(moves_m) <= 8 and (np.array(moves_m) == around).any(axis=1).all()
 
     whole = linearise(model.whole)
-    shared = [np.concatenate(estimates(linearise(fold, intervals._path_secants(whole, fold)))[0].sides_sd)
+    shared = [np.concatenate(estimates(linearise(fold, intervals._path_derivatives(whole, fold)))[0].sides_sd)
               for fold in model.folds]
     np.testing.assert_allclose(shared, own, rtol=0.4)
 

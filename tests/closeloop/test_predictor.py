@@ -28,11 +28,11 @@ def flown(open_ground, seed, part=6, **options):
     return world
 
 
-def predicted(links, with_rest=False):
+def predicted(links, with_shadowing=False):
     """Return folds and the combination upon the log-distance law, without any effect."""
     folds = make_folds(links, 0)
     model = cross_validate(links, make_bases(None, 0)["log-distance"], folds)
-    return model, combined_prediction(model, with_rest, 0)
+    return model, combined_prediction(model, with_shadowing, 0)
 
 
 def rmse_db(links, mean_db):
@@ -77,7 +77,7 @@ def test_on_levels_that_hold_nothing_the_reported_error_is_not_below_theirs(open
         world = flown(open_ground, seed, part=24)
         world.gain_db = np.random.default_rng(seed).normal(-80.0, 6.0, len(world.gain_db))
         links = prepare_links(open_ground.measured(world), None)
-        model, found = predicted(links, with_rest=True)
+        model, found = predicted(links, with_shadowing=True)
         seen = np.isfinite(links.level_db)
         mean_db = np.array([links.level_db[seen & (model.index != fold)].mean() for fold in model.index])
         ratios.append(rmse_db(links, found.reading_db) / rmse_db(links, mean_db))
@@ -103,7 +103,7 @@ def test_near_measurements_interpolation_wins_and_far_from_them_no_tree(open_gro
     world = flown(open_ground, 5, part=1, noise_db=0.5)
     world.gain_db += 7.0 * np.sign(np.sin(world.receiver_m[:, 0] / 40) * np.sin(world.receiver_m[:, 1] / 40))
     links = prepare_links(open_ground.measured(world), None)
-    _, found = predicted(links, with_rest=True)
+    _, found = predicted(links, with_shadowing=True)
     weights = found.combination.weights
     interpolated = sum(weights.get(name, (0.0, 0.0))[0] for name in ("named_and_rest", "kriging"))
     grown_far = sum(far for name, (_, far) in weights.items() if name in (*FORESTS, *LEVEL_FORESTS))

@@ -13,9 +13,9 @@ def held_out(n, sds_db, away_m, seed, limit_db=-np.inf, scale_db=4.0):
     """Return n links whose members are off by normal errors of sizes (3,) [dB], independent ones."""
     rng = np.random.default_rng(seed)
     level_db = rng.normal(-90.0, 8.0, n)
-    members_db = level_db[:, None] + rng.normal(size=(n, len(sds_db))) * sds_db
+    predicted_db = level_db[:, None] + rng.normal(size=(n, len(sds_db))) * sds_db
     nothing = np.zeros(n)
-    return HeldOut(np.where(level_db < limit_db, np.nan, level_db), np.full(n, limit_db), members_db,
+    return HeldOut(np.where(level_db < limit_db, np.nan, level_db), np.full(n, limit_db), predicted_db,
                    np.full((n, len(sds_db)), scale_db), nothing,
                    np.full(n, float(away_m)), nothing, nothing, nothing, np.arange(n) % 5)
 
@@ -34,7 +34,7 @@ def test_what_is_best_held_out_is_kept_though_quadrants_are_predicted_badly_by_i
     found = combination(near, far, NAMES, half_distance_m(near, far), 10.0)
     share = 100.0 / (100.0 + found.half_m)
     weights = np.array([found.weights.get(name, (0.0, 0.0)) for name in NAMES])
-    error_db = near.level_db - near.members_db @ ((1 - share) * weights[:, 0] + share * weights[:, 1])
+    error_db = near.level_db - near.predicted_db @ ((1 - share) * weights[:, 0] + share * weights[:, 1])
     assert np.sqrt(np.mean(error_db**2)) < 1.02 * 3.0
     if away_m > 1000.0:
         assert weights[0, 1] > 0.8  # far away the other one is

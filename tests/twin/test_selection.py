@@ -50,7 +50,7 @@ def test_the_simplest_model_within_a_standard_error_of_the_least_error_is_the_be
     says = "has the least" if found.rmse_db[best] == min(found.rmse_db.values()) else "is as good as the best, and the simplest"
     assert f"{best} {says}" in found.sentence(best)
     assert all(f"{best} would be better: " in found.sentence(each) for each in worse)
-    assert HeldOut.kept({"held_out": found.record}) == found
+    assert HeldOut.from_provenance({"held_out": found.record}) == found
 
 
 def test_few_flights_are_held_out_by_block_of_ground_and_few_readings_not_at_all():
@@ -70,13 +70,13 @@ def test_links_close_together_count_as_one_where_models_are_compared():
 
 def test_by_default_the_best_model_predicts_and_the_network_locates(small_scene, flown, tmp_path):
     twin, network = fit_twin(flown, small_scene), fit_twin(flown, small_scene, "segmented_nn")
-    tried = HeldOut.kept(twin.provenance)
+    tried = HeldOut.from_provenance(twin.provenance)
     assert twin.channel.name == tried.best == "segmented_log_distance" and len(tried.rmse_db) == 4
     assert twin.devices == network.devices and twin.provenance["located_by"] == "segmented_nn"
     named = fit_twin(flown, small_scene, tried.best)
     assert encode_channel(twin.channel) == encode_channel(named.channel) and "held_out" not in named.provenance
     twin.save(tmp_path / "twin")
-    assert HeldOut.kept(type(twin).load(tmp_path / "twin").provenance) == tried
+    assert HeldOut.from_provenance(type(twin).load(tmp_path / "twin").provenance) == tried
     with pytest.raises(BadInput, match="allowed are .*log_distance"):
         fit_twin(flown, small_scene, "automatic")
 
@@ -85,7 +85,7 @@ def test_of_readings_too_few_to_hold_any_out_the_segmented_law_is_learnt(small_s
     anchors = flown.devices["device"][flown.devices["role"] == "anchor"]
     heard = flown.table["device"].isin(anchors[:2]).to_numpy() & np.isfinite(flown.level_db)
     twin = fit_twin(flown.select(heard & (np.cumsum(heard) <= 28)), small_scene)
-    assert twin.channel.name == "segmented_log_distance" and HeldOut.kept(twin.provenance) is None
+    assert twin.channel.name == "segmented_log_distance" and HeldOut.from_provenance(twin.provenance) is None
 
 
 def test_without_torch_the_best_of_the_other_models_predicts_and_the_segmented_law_locates(small_scene, flown, monkeypatch):
@@ -95,7 +95,7 @@ def test_without_torch_the_best_of_the_other_models_predicts_and_the_segmented_l
     monkeypatch.setattr("radiotwin.twin.fit.require_torch", absent)
     with pytest.warns(UserWarning, match=r"segmented_nn is not among the models .*radiotwin\[nn\]"):
         twin = fit_twin(flown, small_scene)
-    assert list(HeldOut.kept(twin.provenance).rmse_db) == ["log_distance", "segmented_log_distance", "kriging"]
+    assert list(HeldOut.from_provenance(twin.provenance).rmse_db) == ["log_distance", "segmented_log_distance", "kriging"]
     assert twin.provenance["located_by"] == "segmented_log_distance" and np.isfinite(twin.device_m).all()
 
 

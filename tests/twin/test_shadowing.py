@@ -6,7 +6,7 @@ import pytest
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.maps.survey import fly_survey, segmented_truth
 from radiotwin.twin import fit_twin
-from radiotwin.twin.shadowing import MapErrors, with_shadowing
+from radiotwin.twin.shadowing import ErrorCorrelation, with_shadowing
 
 
 def test_the_correlation_of_an_interpolating_twin_is_that_of_its_own_field(small_scene, tmp_path):
@@ -43,7 +43,7 @@ def test_levels_of_devices_and_errors_that_last_are_told_apart(level_sd_db):
         residual_db = level_sd_db * rng.normal(size=20)[device] + 5.0 * (
             np.sqrt(0.7) * error + np.sqrt(0.3) * rng.normal(size=len(device)))
         receiver_m = np.column_stack([along_m, np.zeros((len(device), 2))])
-        found.append(MapErrors.of_residuals(device, receiver_m, residual_db, np.full(len(device), 5.0), seed))
+        found.append(ErrorCorrelation.of_residuals(device, receiver_m, residual_db, np.full(len(device), 5.0), seed))
     assert all(each.devices == 20 for each in found)
     assert 0.5 < np.mean([each.share for each in found]) < 0.85
     assert 30.0 < np.mean([each.length_m for each in found]) < 120.0

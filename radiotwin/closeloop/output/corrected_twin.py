@@ -12,7 +12,7 @@ from radiotwin.closeloop.predict.predictor import combined_fit
 from radiotwin.closeloop.run import Loop
 from radiotwin.scene import Scene
 from radiotwin.twin.localize import RadiusCalibration, calibrate_radii, whole_area
-from radiotwin.twin.shadowing import MAP_ERRORS, MapErrors
+from radiotwin.twin.shadowing import MAP_ERRORS, ErrorCorrelation
 from radiotwin.twin.twin import Twin, measured_heights
 
 
@@ -35,7 +35,7 @@ def corrected_twin(loop: Loop, scene: Scene | None) -> Twin:
     residual_db = loop.links.level_db - loop.prediction.map_db
     sd_db = np.where(loop.links.los, *(_sd_db(residual_db[loop.links.los == los])
                                        for los in (True, False)))
-    provenance[MAP_ERRORS] = asdict(MapErrors.of_residuals(
+    provenance[MAP_ERRORS] = asdict(ErrorCorrelation.of_residuals(
         loop.links.device, loop.links.receiver_m, residual_db, sd_db, loop.seed))
     if loop.origin is not None:
         provenance |= {"origin": loop.origin.model_dump()}

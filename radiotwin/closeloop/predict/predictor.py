@@ -1,14 +1,14 @@
 """Combine the named effects, interpolated shadowing, laws and trees into one weighted prediction.
 
 Near measured places interpolation and trees predict best, far from them physics does. So each
-member of the combination has a weight near measurements and one far from them, with a smooth
+predictor of the combination has a weight near measurements and one far from them, with a smooth
 transition. The weights minimise the held-out error on other folds: no reading takes part in the
-members or in the weights by which it is predicted. Nested cross-validation is not needed for so few
-weights (Wainer and Cawley 2021, 'Nested cross-validation when selecting classifiers is overzealous
-for most practical applications', Expert Systems with Applications 182).
+predictors or in the weights by which it is predicted. Nested cross-validation is not needed for so
+few weights (Wainer and Cawley 2021, 'Nested cross-validation when selecting classifiers is
+overzealous for most practical applications', Expert Systems with Applications 182).
 
 Folds and the loop's twin predict by the same code
-(`radiotwin.twin.model.model.FittedModel.law_on`).
+(`radiotwin.twin.model.model.FittedModel.reading_law_on`).
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from radiotwin.propagation.laws.base import ChannelModel
 from radiotwin.propagation.laws.forest import Forest
 from radiotwin.propagation.laws.log_distance import LogDistance
 from radiotwin.runtime.processes import in_threads
-from radiotwin.twin.model.blend import FORESTS, LEVEL_FORESTS, NAMED, REST, Blend
+from radiotwin.twin.model.blend import FORESTS, LEVEL_FORESTS, NAMED, SHADOWED, Blend
 from radiotwin.twin.model.correlated_shadowing import (
     CorrelatedShadowing,
     moving_ends,
@@ -83,26 +83,26 @@ class CombinedPrediction:
         return float((np.abs(known - 0.5) <= 0.45).mean()) if len(known) else np.nan
 
 
-def combined_prediction(model: CrossFit, with_rest: bool, seed: int) -> CombinedPrediction:
+def combined_prediction(model: CrossFit, with_shadowing: bool, seed: int) -> CombinedPrediction:
     """Predict held-out links by a weighted combination of models.
 
-    Members: base with effects, trees on its residual and on levels, interpolated shadowing, laws.
+    Predictors: base with effects, trees on its residual and on levels, shadowing, laws.
     The weights for a fold are fitted to the links of the other folds.
 
     Args:
         model: cross-validated fit with all named effects.
-        with_rest: whether to interpolate the residual even if the model has no shadowing.
+        with_shadowing: whether to interpolate the residual even if the model has no shadowing.
         seed: random seed of trees and samples.
     """
     links = model.links
     parts = [Part(each.links) for each in model.folds]
     baselines, laws = held_out_baselines(model, parts, seed)
-    rest = [REST] if with_rest or model.whole.shadowing else []
-    names = [NAMED, *FORESTS, *LEVEL_FORESTS, *rest,
+    shadowed = [SHADOWED] if with_shadowing or model.whole.shadowing else []
+    names = [NAMED, *FORESTS, *LEVEL_FORESTS, *shadowed,
              *(kind.name for kind in LAWS if kind is not LogDistance)]
 
     def of_fold(number: int) -> tuple[FittedModel, HeldOut]:
-        """Return the members learnt outside a fold, and their prediction of its links."""
+        """Return the predictors learnt outside a fold, and their prediction of its links."""
         fold = model.folds[number]
         learnt = _learn(fold, parts[number], names, seed, laws=laws[number])
         test = np.flatnonzero((model.index == number) & fold.usable)
@@ -121,15 +121,15 @@ def combined_prediction(model: CrossFit, with_rest: bool, seed: int) -> Combined
         fold = model.folds[number]
         test = np.flatnonzero((model.index == number) & fold.usable)
         learnt = _combined(learnt, fold, weights)
-        law = learnt.law_on(fold.on_rows(test))
+        law = learnt.reading_law_on(fold.on_rows(test))
         reading_db[test], rank[test] = law.reading_db, law.rank(links.level_db[test])
-        map_db[test] = learnt.law_on(fold.for_map(test)).mean_db
+        map_db[test] = learnt.reading_law_on(fold.for_map(test)).mean_db
     return CombinedPrediction(reading_db, map_db, rank,
                               combination(held_out, quadrants, names, half_m, dof), baselines)
 
 
 def combined_fit(model: CrossFit, found: Combination, seed: int) -> FittedModel:
-    """Learn the members of a combination from all links, for the loop's twin.
+    """Learn the predictors of a combination from all links, for the loop's twin.
 
     Args:
         model: cross-validated fit with all named effects.
@@ -141,21 +141,21 @@ def combined_fit(model: CrossFit, found: Combination, seed: int) -> FittedModel:
 
 
 def _learn(fit: Fit, part: Part, names: Collection[str], seed: int, trees: int = TREES,
-           rest: CorrelatedShadowing | None = None,
+           shadowing: CorrelatedShadowing | None = None,
            laws: dict[str, ChannelModel] | None = None) -> FittedModel:
-    """Learn the members of a combination (effects, trees, laws, …), all with equal weights.
+    """Learn the predictors of a combination (effects, trees, laws, …), all with equal weights.
 
     Args:
         fit: fit to the training links among n links.
         part: the n links with the features of trees.
-        names: names of the members.
+        names: names of the predictors.
         seed: random seed of trees and samples.
         trees: number of trees.
-        rest: interpolated residual (shadowing); None: it is fitted if it is a member.
+        shadowing: interpolated residual (shadowing); None: it is fitted if it is a predictor.
         laws: laws that were fitted already, by name.
     """
-    if REST in names:
-        rest = rest or fit.shadowing or fit.rest(seed)
+    if SHADOWED in names:
+        shadowing = shadowing or fit.shadowing or fit.fit_shadowing(seed)
     laws = laws or {kind.name: fitted_law(kind, fit.links, fit.train)
                     for kind in LAWS if kind.name in names}
     move = receivers_move(fit.links)
@@ -168,32 +168,32 @@ def _learn(fit: Fit, part: Part, names: Collection[str], seed: int, trees: int =
                   grow_forests(fit, part, seed, names, trees),
                   {name: law for name, law in laws.items() if name in names},
                   np.column_stack([declared, boresight_deg[declared]]))
-    return replace(fit.learnt, shadowing=rest or fit.shadowing, blend=blend)
+    return replace(fit.learnt, shadowing=shadowing or fit.shadowing, blend=blend)
 
 
 def _combined(learnt: FittedModel, fit: Fit, found: Combination) -> FittedModel:
-    """Return a learnt model with the weights of a combination; members without one are dropped."""
+    """Return a learnt model with the weights of a combination, without unweighted predictors."""
     assert learnt.blend is not None
     blend = learnt.blend.weighted(found.weights, found.half_m, found.sd_ratio)
-    shadowing = learnt.shadowing if REST in found.weights else fit.shadowing
+    shadowing = learnt.shadowing if SHADOWED in found.weights else fit.shadowing
     return replace(learnt, blend=blend, shadowing=shadowing)
 
 
 def _held_out(learnt: FittedModel, fit: Fit, test: np.ndarray, fold: np.ndarray) -> HeldOut:
-    """Predict the links `test` (m,) of a fit by each learnt member; `fold` (m,) is their fold."""
+    """Predict the links `test` (m,) of a fit by each predictor; `fold` (m,) is their fold."""
     assert learnt.blend is not None
     tested = fit.on_rows(test)
-    members_db, scales_db, unheard_db = learnt.members_on(tested)
+    predicted_db, scales_db, unheard_db = learnt.predictions_on(tested)
     losses = tested.model.losses
     blank, drop, drop_db = (np.broadcast_to(np.asarray(each, dtype=float), len(test))
                             for each in (losses.blank, losses.drop, losses.drop_db))
-    return HeldOut(tested.links.level_db, tested.model.limit_db, members_db, scales_db, unheard_db,
-                   learnt.blend.away_m(tested.links), blank, drop, drop_db, fold)
+    return HeldOut(tested.links.level_db, tested.model.limit_db, predicted_db, scales_db,
+                   unheard_db, learnt.blend.away_m(tested.links), blank, drop, drop_db, fold)
 
 
 def _hold_out_quadrants(model: CrossFit, learnt: FittedModel, part: Part, names: list[str],
                         seed: int) -> HeldOut:
-    """Predict each quadrant of the last fold's training links by members learnt in the other three.
+    """Predict quadrants of the last fold's training links by predictors learnt in the other three.
 
     Refitted are coefficients, trees and interpolated values. A few searched parameters, such as the
     position of a box or a correlation length, are kept from the fit to all training links.
@@ -213,10 +213,10 @@ def _hold_out_quadrants(model: CrossFit, learnt: FittedModel, part: Part, names:
         if not len(test) or np.isfinite(part.links.level_db[~out]).sum() < MIN_LEARNT:
             continue
         inner = replace(known.model, train=~out).fit(known)
-        rest = None if REST not in names else inner.rest(seed, learnt.shadowing)
+        shadowing = None if SHADOWED not in names else inner.fit_shadowing(seed, learnt.shadowing)
         laws = {kind.name: fitted_law(kind, part.links, ~out, learnt.blend.laws.get(kind.name))
                 for kind in LAWS if kind.name in names}
-        away = _learn(inner, part, names, seed, AWAY_TREES, rest, laws)
+        away = _learn(inner, part, names, seed, AWAY_TREES, shadowing, laws)
         found.append(_held_out(away, inner, test, model.index[rows[test]]))
     return HeldOut.join(found)
 
@@ -239,7 +239,7 @@ def grow_forests(fit: Fit, part: Part, seed: int, names: Collection[str],
         fit: fit to some of n links.
         part: the n links with features.
         seed: random seed of the trees.
-        names: names of the members; only the forests among them are grown.
+        names: names of the predictors; only the forests among them are grown.
         trees: number of trees.
     """
     if not set(names) & set(FORESTS + LEVEL_FORESTS):

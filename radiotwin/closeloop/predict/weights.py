@@ -1,10 +1,10 @@
 """Fit the weights and the error scale of a combination of models to held-out links.
 
 Two sets of links are used: those of held-out folds, and those of held-out quadrants of the area,
-because a map extrapolates. Errors of each set are relative to its best member. Quadrants count less
-if the combination would predict a fold worse than the best member alone; if no weight of theirs
-helps, the best member is taken (the discrete super learner: van der Laan, Polley and Hubbard 2007,
-Statistical Applications in Genetics and Molecular Biology 6).
+because a map extrapolates. Errors of each set are relative to its best predictor. Quadrants count
+less if the combination would predict a fold worse than the best predictor alone; if no weight of
+theirs helps, the best predictor is taken (the discrete super learner: van der Laan, Polley and
+Hubbard 2007, Statistical Applications in Genetics and Molecular Biology 6).
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from radiotwin.inference.student import Losses, ReadingLaw
 from radiotwin.twin.model.blend import NAMED, blended, far_share, sd_factor
 
 HALF_M = 50.0  # half distance if it cannot be estimated from links [m]
-PULL = 0.01  # shrinkage towards the best member, see `convex_weights`: 2 % of the RMSE
+PULL = 0.01  # shrinkage towards the best predictor, see `convex_weights`: 2 % of the RMSE
 QUADRANT_COUNTS = (1.0, 0.25, 0.0625, 0.0)  # weights of the quadrants that are tried in turn
-AS_GOOD = 1.01  # largest ratio of the RMSE on an unseen fold to that of the best member
-MIN_WEIGHT = 0.02  # members with less, near and far, are left out
+AS_GOOD = 1.01  # largest ratio of the RMSE on an unseen fold to that of the best predictor
+MIN_WEIGHT = 0.02  # predictors with less, near and far, are left out
 PASSES = 3  # alternating fits of weights and error scale
 SD_LINKS = 4_000  # sample for the error scale
 LOG_SD_RATIO = 3.0  # bound of its natural logarithm, plus and minus
@@ -31,12 +31,12 @@ SAME_RATIO = 0.01  # penalty for log ratios near and far that differ by 1 [nats/
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """n held-out links with their prediction by each of k members.
+    """n held-out links with their prediction by each of k predictors.
 
     Attributes:
         level_db: (n,) measured level [dB]; NaN = not detected.
         limit_db: (n,) limit of detection [dB].
-        members_db: (n, k) predicted mean level [dB]; NaN without a prediction.
+        predicted_db: (n, k) predicted mean level [dB]; NaN without a prediction.
         scales_db: (n, k) error scale [dB].
         unheard_db: (n,) standard deviation of unheard levels [dB].
         away_m: (n,) distance from the nearest measured place [m].
@@ -46,7 +46,7 @@ class HeldOut:
 
     level_db: np.ndarray
     limit_db: np.ndarray
-    members_db: np.ndarray
+    predicted_db: np.ndarray
     scales_db: np.ndarray
     unheard_db: np.ndarray
     away_m: np.ndarray
@@ -62,7 +62,7 @@ class HeldOut:
         """Return the links of a mask or of indices."""
         return HeldOut(*(getattr(self, each.name)[rows] for each in fields(self)))
 
-    def law(self, mean_db: np.ndarray, scale_db: np.ndarray, dof: float) -> ReadingLaw:
+    def reading_law(self, mean_db: np.ndarray, scale_db: np.ndarray, dof: float) -> ReadingLaw:
         """Return the predicted distribution of readings with means and error scales (n,) [dB]."""
         return ReadingLaw(mean_db, np.hypot(scale_db, self.unheard_db), self.limit_db, dof,
                           Losses(self.blank, self.drop, self.drop_db))
@@ -79,9 +79,9 @@ class Combination:
     """Weights of a combination, see `radiotwin.twin.model.blend.Blend`.
 
     Attributes:
-        weights: weight near measurements and far from them, by the member's name.
+        weights: weight near measurements and far from them, by the predictor's name.
         half_m: distance at which the near and far weights count equally [m].
-        sd_ratio: error scale over that of the members, near and far.
+        sd_ratio: error scale over that of the predictors, near and far.
     """
 
     weights: dict[str, tuple[float, float]]
@@ -108,11 +108,11 @@ def combination(held_out: HeldOut, quadrants: HeldOut, names: list[str], half_m:
     Args:
         held_out: links of held-out folds.
         quadrants: links of held-out quadrants.
-        names: names of the k members.
+        names: names of the k predictors.
         half_m: `half_distance_m` of both sets [m].
         dof: degrees of freedom of the Student-t errors.
     """
-    held_out, quadrants = (each.select(np.isfinite(each.members_db).all(axis=1))
+    held_out, quadrants = (each.select(np.isfinite(each.predicted_db).all(axis=1))
                            for each in (held_out, quadrants))
     if not np.isfinite(held_out.level_db).any():  # nothing could be held out
         return Combination({NAMED: (1.0, 1.0)}, half_m, (1.0, 1.0))
@@ -126,10 +126,10 @@ def combination(held_out: HeldOut, quadrants: HeldOut, names: list[str], half_m:
 
 def _weights(held_out: HeldOut, quadrants: HeldOut, half_m: float, sd_ratio: tuple[float, float],
              dof: float) -> np.ndarray:
-    """Fit weights (2, k) of k members, near and far, by least squared error of readings.
+    """Fit weights (2, k) of k predictors, near and far, by least squared error of readings.
 
     `quadrants` count less, until unseen folds are predicted nearly as well (`AS_GOOD`) as by the
-    best member; otherwise this member gets all weight. Weights below `MIN_WEIGHT` become 0.
+    best predictor; otherwise this one gets all weight. Weights below `MIN_WEIGHT` become 0.
     """
     sets = []
     for links in (held_out, quadrants):
@@ -137,8 +137,8 @@ def _weights(held_out: HeldOut, quadrants: HeldOut, half_m: float, sd_ratio: tup
         share = far_share(links.away_m, half_m)
         factor = sd_factor(share, sd_ratio)
         error_db = links.level_db[:, None] - np.column_stack(
-            [links.law(mean_db, scale_db * factor, dof).reading_db
-             for mean_db, scale_db in zip(links.members_db.T, links.scales_db.T, strict=True)])
+            [links.reading_law(mean_db, scale_db * factor, dof).reading_db
+             for mean_db, scale_db in zip(links.predicted_db.T, links.scales_db.T, strict=True)])
         best_db = np.sqrt(np.square(error_db).mean(axis=0).min()) if len(links) else 1.0
         sets.append((error_db / max(best_db, 1e-6), share, links.fold))
     (error, share, fold), (error_quadrants, share_quadrants, fold_quadrants) = sets
@@ -167,18 +167,20 @@ def _weights(held_out: HeldOut, quadrants: HeldOut, half_m: float, sd_ratio: tup
 
 def _sd_ratio(held_out: HeldOut, quadrants: HeldOut, weights: np.ndarray, half_m: float,
               dof: float) -> tuple[float, float]:
-    """Fit the error scale of the combination over that of its members, near and far, by likelihood.
+    """Fit the error scale of the combination over that of its predictors, by likelihood.
+
+    One near and one far from measurements.
 
     `quadrants` are used, too, as errors far from measurements show only in them.
     """
     links = HeldOut.join([held_out, quadrants])
     links = links.select(np.arange(0, len(links), max(len(links) // SD_LINKS, 1)))
     share = far_share(links.away_m, half_m)
-    mean_db, scale_db = blended(links.members_db, links.scales_db, share, weights, (1.0, 1.0))
+    mean_db, scale_db = blended(links.predicted_db, links.scales_db, share, weights, (1.0, 1.0))
 
     def objective(log_ratio: np.ndarray) -> float:
         near, far = np.exp(log_ratio)
-        law = links.law(mean_db, scale_db * sd_factor(share, (near, far)), dof)
+        law = links.reading_law(mean_db, scale_db * sd_factor(share, (near, far)), dof)
         return float(law.nll(links.level_db).mean()
                      + 0.5 * SAME_RATIO * (log_ratio[0] - log_ratio[1]) ** 2)
 

@@ -34,7 +34,7 @@ def add_shadowing(state: SearchState, inputs: SearchInputs) -> SearchState:
     """Interpolate the residual over positions (kriging), if that makes held-out links likelier."""
     inputs.on_progress(SHADOWING)
     model = state.model
-    fields = [each.rest(inputs.seed) for each in model.fits]
+    fields = [each.fit_shadowing(inputs.seed) for each in model.fits]
     # The second try corrects the mean only and leaves the error scale as wide as before, which may
     # help if the field does not repeat on held-out flights.
     for tried in (fields, [replace(each, certain=False) for each in fields]):

@@ -26,7 +26,7 @@ from radiotwin.inference.sandwich import MAX_WIDTH
 from radiotwin.inference.student import DOF
 from radiotwin.links import evidence_blocks
 from radiotwin.twin.model.model import Fit
-from radiotwin.twin.model.uncertainty import Linearised, Secant, estimates, linearise
+from radiotwin.twin.model.uncertainty import Linearised, ReadingDerivative, estimates, linearise
 
 QUANTILE = 0.95  # upper end of a 90 % interval
 MIN_CHANGE_DB = 1e-6  # smaller changes of a reading are rounding errors: the effect does not act
@@ -40,7 +40,7 @@ def effect_parameters(model: CrossFit) -> list[dict[str, Parameter]]:
     """
     whole = linearise(model.whole)
     whole_estimates = estimates(whole)
-    fold_estimates = [estimates(linearise(fold, _path_secants(whole, fold)))
+    fold_estimates = [estimates(linearise(fold, _path_derivatives(whole, fold)))
                       for fold in model.folds]
     found, matches = [], [match_effects(model.whole, fold) for fold in model.folds]
     for number, (effect, estimate) in enumerate(zip(model.whole.effects, whole_estimates,
@@ -56,7 +56,7 @@ def effect_parameters(model: CrossFit) -> list[dict[str, Parameter]]:
     return found
 
 
-def _path_secants(whole: Linearised, fold: Fit) -> dict[int, list[Secant]]:
+def _path_derivatives(whole: Linearised, fold: Fit) -> dict[int, list[ReadingDerivative]]:
     """Copy derivatives of readings along paths from the fit to all links, by a fold's effect index.
 
     Following paths around each fold's values would take minutes, and a fold's derivatives only tell
@@ -70,7 +70,7 @@ def _path_secants(whole: Linearised, fold: Fit) -> dict[int, list[Secant]]:
         other = fold.effects[match].variation()
         if other is not None and other.follows_paths and len(other.values) == len(variation.values):
             known[match] = [each.moved(whole.fit.train, fold.train)
-                            for each in whole.secants[number]]
+                            for each in whole.derivatives[number]]
     return known
 
 

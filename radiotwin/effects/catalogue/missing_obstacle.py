@@ -204,8 +204,9 @@ class MissingObstacle(GainEffect):
             level_db[around] = level_at(links.select(around), True)
             known.follow(np.flatnonzero(around))
         top_m = float(city.ground_height_m(*box[:2])) + box.height_m
-        power = known.past(UprightBox(box[:2], (box.length_m / 2, box.width_m / 2),
-                                      float(np.radians(box.turn_deg)), top_m), rows)
+        upright = UprightBox(box[:2], (box.length_m / 2, box.width_m / 2),
+                             float(np.radians(box.turn_deg)), top_m)
+        power = known.powers_with_box(upright, rows)
         before = power.direct + power.others
         # Power that the channel adds to that of the paths, such as diffuse power, passes any box.
         rest = np.maximum(10 ** (level_db[rows] / 10) - before, 0.0)

@@ -389,7 +389,7 @@ class KnownPaths:
         self._direct = np.zeros(len(geometry))
         self._paths: tuple[np.ndarray, ...] = ()  # link, power, points, number of points; (p, ...)
 
-    def past(self, box: UprightBox, rows: np.ndarray) -> Power:
+    def powers_with_box(self, box: UprightBox, rows: np.ndarray) -> Power:
         """Return the power gains of links `rows` (r,) with and without the paths that a box blocks.
 
         Args:

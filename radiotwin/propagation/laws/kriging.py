@@ -115,8 +115,9 @@ class ResidualField:
         numbers = list(rows_of_series)
         if len(numbers) > MAX_SERIES_TO_FIT:
             numbers = np.sort(rng.choice(numbers, MAX_SERIES_TO_FIT, replace=False)).tolist()
-        samples = [_sample(_merged(position_m[rows], residual[rows], kind[rows], SAME_POINT_M), rng)
-                   for rows in (rows_of_series[number] for number in numbers)]
+        merged = (_merged(position_m[rows], residual[rows], kind[rows], SAME_POINT_M)
+                  for rows in (rows_of_series[number] for number in numbers))
+        samples = [_random_points(field, rng) for field in merged]
         self._fit_correlation(samples, len(np.unique(kind)) > 1)
         self._factor()
         return self
@@ -355,7 +356,7 @@ def _merged(position_m: np.ndarray, residual: np.ndarray, kind: np.ndarray,
     return _Field(np.column_stack(means[:3]), means[3], means[4].round().astype(int), count)
 
 
-def _sample(field: _Field, rng: np.random.Generator) -> _Field:
+def _random_points(field: _Field, rng: np.random.Generator) -> _Field:
     """Draw at most MAX_POINTS_TO_FIT points at random."""
     if len(field.residual) <= MAX_POINTS_TO_FIT:
         return field

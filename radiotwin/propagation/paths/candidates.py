@@ -60,7 +60,7 @@ EDGE_CHUNK = 100  # edges whose surroundings are searched at a time: about 100 M
 MAX_REMEMBERED_BYTES = 2**25  # cache of one search; 400 MB for all searches of `candidate_search`
 
 
-class Ways(NamedTuple):
+class PathsToEdges(NamedTuple):
     """Partial paths from a device by reflections to w edges.
 
     Attributes:
@@ -76,8 +76,8 @@ class Ways(NamedTuple):
     source_m: np.ndarray
 
 
-def _open_ways(city: CityMap, surfaces: Surfaces, before: np.ndarray, edge: np.ndarray,
-               device_m: np.ndarray) -> Ways:
+def _open_paths_to_edges(city: CityMap, surfaces: Surfaces, before: np.ndarray, edge: np.ndarray,
+                         device_m: np.ndarray) -> PathsToEdges:
     """Select the partial paths from the device (3,) [m] to edges that no obstacle blocks.
 
     A partial path reflects at the facets in a row of `before` (w, a) and ends on the edge in `edge`
@@ -90,12 +90,12 @@ def _open_ways(city: CityMap, surfaces: Surfaces, before: np.ndarray, edge: np.n
     for first in SAMPLE_ORDER:  # a few points suffice for most open ways
         way = 0
         while way < len(edge):
-            found, way = _sample(surfaces, before, edge, device_m, lit_m, samples, is_seen, first,
-                                 way, points)
+            found, way = _sample_edges(surfaces, before, edge, device_m, lit_m, samples, is_seen,
+                                       first, way, points)
             clear = clear_paths(city, surfaces, reflections, points, found)
             is_seen[points.candidate[clear]] = True
     seen = np.flatnonzero(is_seen)
-    return Ways(before[seen], edge[seen], lit_m[seen], source_m[seen])
+    return PathsToEdges(before[seen], edge[seen], lit_m[seen], source_m[seen])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -104,7 +104,8 @@ def _lit_parts(surfaces: Surfaces, before: np.ndarray, edge: np.ndarray, device_
     """Return the part of each edge that the device can light by its reflections (w, 2) [m].
 
     Also the position and distance of the device's image along and from the edge (w, 2) [m], and the
-    number of points to sample on the lit part (w,). All are 0 if nothing is lit. See `Ways`.
+    number of points to sample on the lit part (w,). All are 0 if nothing is lit. See
+    `PathsToEdges`.
     """
     image = np.empty((MAX_INTERACTIONS + 1, 3))
     lit_m, source_m = np.zeros((len(edge), 2)), np.zeros((len(edge), 2))
@@ -128,9 +129,9 @@ def _lit_parts(surfaces: Surfaces, before: np.ndarray, edge: np.ndarray, device_
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _sample(surfaces: Surfaces, before: np.ndarray, edge: np.ndarray, device_m: np.ndarray,
-            lit_m: np.ndarray, samples: np.ndarray, is_seen: np.ndarray, first: int, way: int,
-            points: PathBuffer) -> tuple[int, int]:
+def _sample_edges(surfaces: Surfaces, before: np.ndarray, edge: np.ndarray, device_m: np.ndarray,
+                  lit_m: np.ndarray, samples: np.ndarray, is_seen: np.ndarray, first: int, way: int,
+                  points: PathBuffer) -> tuple[int, int]:
     """Fill a buffer with paths from the device, by reflections, to sampled points of edges.
 
     A way is a row of `before` and `edge`: facets that reflect, then an edge. Of its `samples`,
@@ -175,7 +176,7 @@ def _sample(surfaces: Surfaces, before: np.ndarray, edge: np.ndarray, device_m: 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _with_facets_after(surfaces: Surfaces, ways: Ways, first: np.ndarray, end: np.ndarray,
+def _with_facets_after(surfaces: Surfaces, ways: PathsToEdges, first: np.ndarray, end: np.ndarray,
                        after: np.ndarray, parent: np.ndarray, depth: int
                        ) -> tuple[np.ndarray, np.ndarray]:
     """Combine each partial path to an edge with the facet sequences that rays reach after it.
@@ -451,9 +452,10 @@ class CandidateSearch:
         reflected = sequences.facets[sequences.order > 0]
         reflections = np.unique(np.concatenate(
             [reflected, single, self._corner_sequences(facing)]), axis=0)
-        ways = _open_ways(self._city, self.surfaces, *self._to_edges(sequences, facing), device_m)
+        ways = _open_paths_to_edges(self._city, self.surfaces,
+                                    *self._to_edges(sequences, facing), device_m)
         with self._lock:
-            self._look_around(np.unique(ways.edge[self._first_after[ways.edge] < 0]))
+            self._shoot_from_edges(np.unique(ways.edge[self._first_after[ways.edge] < 0]))
             after, parent = self._after, self._parent_after  # other threads only append rows
         way, row = _with_facets_after(self.surfaces, ways, self._first_after, self._end_after,
                                      after, parent, self._depth)
@@ -488,7 +490,7 @@ class CandidateSearch:
         ways = np.unique(np.column_stack([pairs[row, 0], edge]), axis=0)
         return sequences.facets[ways[:, 0]], ways[:, 1]
 
-    def _look_around(self, edges: np.ndarray) -> None:
+    def _shoot_from_edges(self, edges: np.ndarray) -> None:
         """Shoot rays from edges (n,) and cache the facet sequences hit, for later devices."""
         after, parents, count = [self._after], [self._parent_after], len(self._after)
         for start in range(0, len(edges), EDGE_CHUNK):

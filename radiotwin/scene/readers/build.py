@@ -229,12 +229,13 @@ def build_scene_from_map(
     flat, shells = ([one for one in features if (one.shell is not None) == has_shell]
                     for has_shell in (False, True))
     prisms, problems = make_prisms(flat, origin, materials, default_m, height_column)
-    bodies, body_problems = make_shell_prisms(shells, origin, materials)
-    prisms += bodies
+    models, model_problems = make_shell_prisms(shells, origin, materials)
+    prisms += models
     _check_unit(prisms, found.plan_m, height_column, path)
-    problems = (found.problems + left_out + problems + body_problems
+    problems = (found.problems + left_out + problems + model_problems
                 + _default_height_problems(prisms, features, options.default_height_m, path)
-                + implausible_heights([(prism.name, prism.height, prism.site or prism.area)
+                + implausible_heights([(prism.name, prism.height,
+                                        prism.building_footprint or prism.area)
                                        for prism in prisms],
                                       {feature.name: feature.tags for feature in features}))
     if not prisms:

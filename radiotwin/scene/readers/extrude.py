@@ -33,7 +33,7 @@ class Block:
     Attributes:
         members: indices of the prisms, the largest first.
         material: material of all of them.
-        mesh: watertight with outward normals, unless it is an open body [m].
+        mesh: watertight with outward normals, unless a 3D model is open [m].
     """
 
     members: list[int]
@@ -48,7 +48,8 @@ def make_blocks(prisms: Sequence[Prism], contacts: Contacts) -> list[Block]:
     """
     if not prisms:
         return []
-    is_open = np.array([prism.body is not None and prism.body.solid is None for prism in prisms])
+    is_open = np.array([prism.model_surfaces is not None and prism.model_surfaces.solid is None
+                        for prism in prisms])
     pairs = contacts.pairs[contacts.shared_m > GRID_M]
     pairs = pairs[~is_open[pairs].any(axis=1)]
     same = np.array([prisms[a].material == prisms[b].material for a, b in pairs], dtype=bool)
@@ -66,9 +67,9 @@ def make_blocks(prisms: Sequence[Prism], contacts: Contacts) -> list[Block]:
         for block, part in enumerate(np.split(order, np.cumsum(np.bincount(block_of))[:-1])):
             members = sorted(part.tolist(), key=lambda i: -volume_m3[i])
             advance(1)
-            body = prisms[members[0]].body
-            if body is not None and body.mesh is not None:
-                vertices, faces = body.mesh
+            surfaces = prisms[members[0]].model_surfaces
+            if surfaces is not None and surfaces.mesh is not None:
+                vertices, faces = surfaces.mesh
                 rise_m = prisms[members[0]].height.top_m - vertices[:, 2].max()
                 mesh = trimesh.Trimesh(vertices + [0, 0, rise_m], faces, process=False)
                 blocks.append(Block(members, prisms[members[0]].material, mesh))
@@ -104,8 +105,8 @@ def _union(solids: list[Manifold]) -> Manifold:
 
 def _prism_solid(prism: Prism, wider_m: float = 0.0) -> Manifold:
     """Return a building or part as a solid, with all its faces moved outwards by `wider_m`."""
-    if prism.body is not None:
-        solid = _placed_body(prism)
+    if prism.model_surfaces is not None:
+        solid = _placed_model(prism)
         return _union([solid.translate(wider_m * corner) for corner in _CORNERS]) if wider_m \
             else solid
     assert isinstance(prism.area, shapely.Polygon)
@@ -113,15 +114,15 @@ def _prism_solid(prism: Prism, wider_m: float = 0.0) -> Manifold:
     return _extruded(area, prism.height.bottom_m - wider_m, prism.height.top_m + wider_m)
 
 
-def _placed_body(prism: Prism) -> Manifold:
+def _placed_model(prism: Prism) -> Manifold:
     """Return the solid of a building from a 3D model, moved so that its top is at the prism's.
 
     On terrain the prism's bottom is lower than the moved solid's: vertical walls fill the gap.
     """
-    assert prism.body is not None and prism.body.solid is not None
-    _, _, low_m, _, _, high_m = prism.body.solid.bounding_box()
+    assert prism.model_surfaces is not None and prism.model_surfaces.solid is not None
+    _, _, low_m, _, _, high_m = prism.model_surfaces.solid.bounding_box()
     rise_m, height = prism.height.top_m - high_m, prism.height
-    solid = prism.body.solid.translate((0, 0, rise_m))
+    solid = prism.model_surfaces.solid.translate((0, 0, rise_m))
     if low_m + rise_m - height.bottom_m <= GRID_M:
         return solid
     return _union([solid, *(_extruded(polygon, height.bottom_m, low_m + rise_m)

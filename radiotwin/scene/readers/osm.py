@@ -100,7 +100,7 @@ class OsmElements:
     nodes_at: dict[tuple[float, float], int] = field(default_factory=dict)
     remarked: bool = False
 
-    def node_at(self, place: tuple[float, float], number: int | None = None) -> int:
+    def store_node(self, place: tuple[float, float], number: int | None = None) -> int:
         """Store a node's position; return its id: if None, that of a known node there, or new."""
         known = self.nodes_at.setdefault(
             place, _MADE_UP - len(self.nodes_at) if number is None else number)
@@ -423,7 +423,7 @@ def osm_of_json(path: Path, document: Mapping) -> OsmElements:
         if element.get("visible") is not False:
             by_kind.get(str(element.get("type")), []).append((f"{path}: element {number}", element))
     for subject, element in by_kind["node"]:
-        elements.node_at(_position(subject, element), _whole(subject, element.get("id")))
+        elements.store_node(_position(subject, element), _whole(subject, element.get("id")))
     for subject, element in (*by_kind["way"], *by_kind["relation"]):
         _add_element(elements, subject, element)
     return elements
@@ -451,7 +451,7 @@ def _nodes(elements: OsmElements, subject: str, element: Mapping) -> list[int]:
     for row, point in enumerate(_list(subject, element, "geometry")):
         if isinstance(point, dict):  # null: outside of Overpass's box
             number = nodes[row] if row < len(nodes) else None
-            nodes[row:row + 1] = [elements.node_at(_position(subject, point), number)]
+            nodes[row:row + 1] = [elements.store_node(_position(subject, point), number)]
         elif row >= len(nodes):
             nodes.append(0)  # a node without a position
     VERTICES.check(len(elements.positions), "the map")

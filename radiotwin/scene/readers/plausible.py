@@ -51,20 +51,20 @@ def implausible_heights(buildings: Sequence[tuple[str, Height, BaseGeometry]],
         columns: name of a building -> its tags.
     """
     tallest: dict[str, tuple[str, Height, BaseGeometry]] = {}
-    for name, height, site in buildings:
+    for name, height, footprint in buildings:
         if height.source != "default" and (
                 name not in tallest or height.top_m > tallest[name][1].top_m):
-            tallest[name] = name, height, site
+            tallest[name] = name, height, footprint
     known = list(tallest.values())
     tops_m = np.array([height.top_m for _, height, _ in known])
     if not len(tops_m):
         return []
-    sites: Any = np.array([site for _, _, site in known], dtype=object)
-    bounds_m = shapely.bounds(sites)
+    footprints: Any = np.array([footprint for _, _, footprint in known], dtype=object)
+    bounds_m = shapely.bounds(footprints)
     # A building is at least as wide as its area over its diagonal: most need no exact width
-    least_m = shapely.area(sites) / np.hypot(*(bounds_m[:, 2:] - bounds_m[:, :2]).T)
-    wide_m = np.array([_width_m(site) if top_m > RARE_SLENDERNESS * low_m else math.inf
-                       for site, top_m, low_m in zip(sites, tops_m, least_m)])
+    least_m = shapely.area(footprints) / np.hypot(*(bounds_m[:, 2:] - bounds_m[:, :2]).T)
+    wide_m = np.array([_width_m(footprint) if top_m > RARE_SLENDERNESS * low_m else math.inf
+                       for footprint, top_m, low_m in zip(footprints, tops_m, least_m)])
     rare = (tops_m > RARE_M) | (tops_m > RARE_SLENDERNESS * np.maximum(wide_m, 1.0))
     median_m = float(np.median(tops_m)) if len(tops_m) > 1 else ROOM_M
     shifted = median_m > MAX_MEDIAN_M
@@ -75,7 +75,7 @@ def implausible_heights(buildings: Sequence[tuple[str, Height, BaseGeometry]],
     if not (rare.any() or shifted):
         return []
     named = np.flatnonzero(rare if rare.any() else tops_m > MAX_MEDIAN_M)
-    examples = [f"{known[row][0]}: {tops_m[row]:.4g} m tall, {_width_m(sites[row]):.3g} m wide"
+    examples = [f"{known[row][0]}: {tops_m[row]:.4g} m tall, {_width_m(footprints[row]):.3g} m wide"
                 for row in sorted(named, key=lambda row: -tops_m[row])]
     what = (f"building(s) are taller than {RARE_M:g} m, or than {RARE_SLENDERNESS:g} times their "
             "width, as hardly any building is" if rare.any() else
@@ -84,9 +84,9 @@ def implausible_heights(buildings: Sequence[tuple[str, Height, BaseGeometry]],
     return problems_of(examples, what + _remedy(known[int(named[0])][1].source, known, columns))
 
 
-def _width_m(site: BaseGeometry) -> float:
+def _width_m(footprint: BaseGeometry) -> float:
     """Return the shorter side of the narrowest rectangle around an area [m]."""
-    corners = shapely.get_coordinates(shapely.oriented_envelope(site))
+    corners = shapely.get_coordinates(shapely.oriented_envelope(footprint))
     sides_m = np.linalg.norm(np.diff(corners, axis=0), axis=1)
     return float(sides_m[:2].min()) if len(sides_m) > 1 else 0.0
 

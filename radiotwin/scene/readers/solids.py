@@ -44,7 +44,7 @@ _DECIMALS = 4  # of corners [m]: equal ones are welded, as by `meshes.WELD_M`
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class ModelSurfaces:
     """Surfaces of a building from a 3D model, in the local frame [m].
 
     Attributes:
@@ -58,16 +58,17 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class Prism:
-    """A building or part of one, with vertical walls and a flat roof, or with a body.
+    """A building or part of one, with vertical walls and a flat roof, or a 3D model.
 
     Attributes:
         name: name of the feature; several prisms may share one.
-        area: one valid polygon in the local frame; with a body, its footprint [m].
+        area: one valid polygon in the local frame; with a 3D model, its footprint [m].
         height: bottom and top, and their source.
         material: material of its surfaces.
         material_from: tag that the material follows from, or `default`.
-        body: surfaces of a 3D model; None: vertical walls and a flat roof over the area.
-        site: footprint of the whole building, whose ground the height counts from; None: the area.
+        model_surfaces: surfaces of a 3D model; None: vertical walls and a flat roof over the area.
+        building_footprint: footprint of the whole building, whose ground the height counts from;
+            None: the area.
         ground_m: height of that ground above the datum [m].
     """
 
@@ -76,8 +77,8 @@ class Prism:
     height: Height
     material: Material
     material_from: str
-    body: Body | None = None
-    site: BaseGeometry | None = None
+    model_surfaces: ModelSurfaces | None = None
+    building_footprint: BaseGeometry | None = None
     ground_m: float = 0.0
 
 
@@ -103,7 +104,7 @@ def make_prisms(
     parts = [(feature, area) for feature, area in areas if feature.is_part]
     prisms = []
     lowest_m: dict[str, float] = {}  # by building
-    for feature, area, (building, site) in _resolve_parts(buildings, parts, defects):
+    for feature, area, (building, footprint) in _resolve_parts(buildings, parts, defects):
         height = height_of(feature.tags, default_height_m, height_column)
         if is_below_zero(feature.tags, "layer") or is_below_zero(feature.tags, "level"):
             defects.add("layer", feature.name)
@@ -116,7 +117,8 @@ def make_prisms(
         if unknown:
             defects.add("material", f"{feature.name}: {unknown}")
         material, material_from = table.material_of(feature.tags)
-        prisms += [Prism(feature.name, polygon, height, material, material_from, site=site)
+        prisms += [Prism(feature.name, polygon, height, material, material_from,
+                         building_footprint=footprint)
                    for polygon in shapely.get_parts(area)]
         if not building.is_part:  # a part without an outline may stand on something else
             lowest_m[building.name] = min(lowest_m.get(building.name, np.inf), height.bottom_m)
@@ -351,7 +353,7 @@ def make_shell_prisms(features: Sequence[Feature], origin: Origin, table: Materi
                       ) -> tuple[list[Prism], list[Problem]]:
     """Make a prism from each building with 3D surfaces (a shell); also return the problems.
 
-    The prism has the shell's footprint, bottom and top, and its surfaces as body.
+    The prism has the shell's footprint, bottom and top, and its surfaces.
 
     Args:
         features: features with shells.
@@ -377,23 +379,24 @@ def make_shell_prisms(features: Sequence[Feature], origin: Origin, table: Materi
         if not 0 < top_m <= MAX_HEIGHT_M:
             defects.add("too tall", f"{feature.name}: {top_m:.4g} m")
             continue
-        body, closed = _body(vertices, faces)
+        model_surfaces, closed = _model_surfaces(vertices, faces)
         if not closed:
             defects.add("open", feature.name)
         if value := table.unknown(feature.tags):
             defects.add("material", f"{feature.name}: {value}")
         height = Height(float(bottom_m), float(top_m), "model")
-        prisms.append(Prism(feature.name, area, height, *table.material_of(feature.tags), body))
-    return _with_sites(prisms), defects.problems()
+        prisms.append(Prism(feature.name, area, height, *table.material_of(feature.tags),
+                            model_surfaces))
+    return _with_building_footprints(prisms), defects.problems()
 
 
-def _with_sites(prisms: Sequence[Prism]) -> list[Prism]:
+def _with_building_footprints(prisms: Sequence[Prism]) -> list[Prism]:
     """Return the prisms with the footprint of their whole building: the union by name."""
     areas: dict[str, list[BaseGeometry]] = {}
     for prism in prisms:
         areas.setdefault(prism.name, []).append(prism.area)
-    sites = {name: shapely.union_all(parts) for name, parts in areas.items()}
-    return [replace(prism, site=sites[prism.name]) for prism in prisms]
+    footprints = {name: shapely.union_all(parts) for name, parts in areas.items()}
+    return [replace(prism, building_footprint=footprints[prism.name]) for prism in prisms]
 
 
 def elevation_fact(features: Sequence[Feature]) -> str:
@@ -450,7 +453,7 @@ def _footprint(vertices: np.ndarray, faces: np.ndarray, name: str) -> shapely.Mu
     return _polygons(shapely.union_all(shapely.set_precision(flat, GRID_M)))
 
 
-def _body(vertices: np.ndarray, faces: np.ndarray) -> tuple[Body, bool]:
+def _model_surfaces(vertices: np.ndarray, faces: np.ndarray) -> tuple[ModelSurfaces, bool]:
     """Return a building's triangles as a solid if closed, else as a mesh; and whether closed."""
     used, faces = np.unique(faces, return_inverse=True)
     vertices, faces = vertices[used], faces.reshape(-1, 3)
@@ -461,10 +464,10 @@ def _body(vertices: np.ndarray, faces: np.ndarray) -> tuple[Body, bool]:
         faces = np.asarray(mesh.faces)
         solid = closed_solid(vertices, faces)
     if solid is not None:
-        return Body(solid, None), True
+        return ModelSurfaces(solid, None), True
     cleaned = clean(vertices, faces)[:2]
     surfaces = Surfaces([cleaned])
-    return Body(None, (cleaned[0], surfaces.turned(surfaces.inward()).faces)), False
+    return ModelSurfaces(None, (cleaned[0], surfaces.turned(surfaces.inward()).faces)), False
 
 
 def closed_solid(vertices: np.ndarray, faces: np.ndarray) -> Manifold | None:

@@ -514,17 +514,20 @@ def raise_to_terrain(prisms: Sequence[Prism], ground: Ground) -> list[Prism]:
     """
     if ground.config is None:
         return list(prisms)
-    # Parts of a building share its site: the ground is looked up once for all
-    sites = {id(site): site for site in (prism.site or prism.area for prism in prisms)}
-    lowest_m = dict(zip(sites, _lowest_ground_m(list(sites.values()), ground).tolist()))
+    # Parts of a building share its footprint: the ground is looked up once for all
+    footprints = {id(footprint): footprint for footprint in (
+        prism.building_footprint or prism.area for prism in prisms)}
+    lowest_m = dict(zip(footprints, _lowest_ground_m(list(footprints.values()), ground).tolist()))
     stood = []
     for prism in prisms:
-        low_m, height = round(lowest_m[id(prism.site or prism.area)], 3), prism.height
+        low_m, height = round(lowest_m[id(prism.building_footprint or prism.area)], 3), prism.height
         bottom_m = low_m + height.bottom_m if height.bottom_m > 0 else low_m - SKIRT_M
-        body = prism.body
-        if body is not None and body.mesh is not None:  # a closed one is moved by its height later
-            body = replace(body, mesh=(body.mesh[0] + [0.0, 0.0, low_m], body.mesh[1]))
-        stood.append(replace(prism, ground_m=low_m, body=body, height=replace(
+        surfaces = prism.model_surfaces
+        # Closed ones are moved by their height later.
+        if surfaces is not None and surfaces.mesh is not None:
+            corners_m, faces = surfaces.mesh
+            surfaces = replace(surfaces, mesh=(corners_m + [0.0, 0.0, low_m], faces))
+        stood.append(replace(prism, ground_m=low_m, model_surfaces=surfaces, height=replace(
             height, bottom_m=bottom_m, top_m=low_m + height.top_m)))
     return stood
 

@@ -73,9 +73,9 @@ class PositionPosterior:
 
         The likelihood is raised to `power`, at most 1, for the radius only: lower powers widen it.
         """
-        best = int((self.apart_m @ _share(self.log_likelihood)).argmin())
+        best = int((self.apart_m @ _normalised(self.log_likelihood)).argmin())
         order = np.argsort(self.apart_m[best])
-        cumulated = np.cumsum(_share(power * self.log_likelihood)[order])
+        cumulated = np.cumsum(_normalised(power * self.log_likelihood)[order])
         reached = int(np.searchsorted(cumulated, CREDIBLE))
         radius_m = self.apart_m[best][order[min(reached, len(order) - 1)]] + self.width_m / 2
         x_m, y_m = self.cells_m[best].tolist()
@@ -168,7 +168,7 @@ def _finer(log_likelihood: np.ndarray, power: float, coarse_m: np.ndarray,
     The likelihood is raised to `power` before. Returns centres (c, 2) and width of the fine cells
     [m].
     """
-    share = _share(power * log_likelihood)
+    share = _normalised(power * log_likelihood)
     order = np.argsort(-share)
     held = order[:int(np.searchsorted(np.cumsum(share[order]), HELD)) + 1]
     split = int(np.clip(np.sqrt(MAX_FINE_CELLS / len(held)), 1, MAX_SPLIT))
@@ -177,7 +177,7 @@ def _finer(log_likelihood: np.ndarray, power: float, coarse_m: np.ndarray,
     return (coarse_m[held, None] + around_m).reshape(-1, 2), width_m / split
 
 
-def _share(log_likelihood: np.ndarray) -> np.ndarray:
+def _normalised(log_likelihood: np.ndarray) -> np.ndarray:
     """Normalise log-likelihoods (c,) [nats] to probabilities."""
     share = np.exp(log_likelihood - log_likelihood.max())
     return share / share.sum()

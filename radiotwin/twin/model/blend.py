@@ -1,7 +1,7 @@
 """Blend: weighted mean of the fitted model, kriging and regression trees.
 
-Near measurements, interpolation and trees predict best; far from them, physics does. So each member
-has a weight near measurements and one far from them, found on held-out links by
+Near measurements, interpolation and trees predict best; far from them, physics does. So each
+predictor has a weight near measurements and one far from them, found on held-out links by
 `radiotwin.closeloop.predict.weights`. Folds of the loop predict by the same class as twins.
 """
 
@@ -30,9 +30,9 @@ from radiotwin.propagation.laws.kriging import RegressionKriging
 from radiotwin.propagation.laws.log_distance import SegmentedLogDistance
 from radiotwin.twin.model.correlated_shadowing import moving_ends
 
-NAMED, REST = "named", "named_and_rest"  # members: named effects, without and with shadowing
-FORESTS = ("named_and_trees", "named_and_boosting")  # members: trees of residuals of named effects
-LEVEL_FORESTS = ("trees_of_levels", "boosting_of_levels")  # members: trees of levels
+NAMED, SHADOWED = "named", "named_and_rest"  # predictors: named effects without, with shadowing
+FORESTS = ("named_and_trees", "named_and_boosting")  # trees of residuals of named effects
+LEVEL_FORESTS = ("trees_of_levels", "boosting_of_levels")  # trees of levels
 LAWS = {law.name: law for law in (SegmentedLogDistance, RegressionKriging)}
 MAX_SD_RATIO = 100.0  # largest in a file
 
@@ -58,29 +58,29 @@ def sd_factor(share: np.ndarray, sd_ratio: tuple[float, float]) -> np.ndarray:
     return np.sqrt((1 - share) * near + share * far)
 
 
-def blended(members_db: np.ndarray, scales_db: np.ndarray, share: np.ndarray,
+def blended(predicted_db: np.ndarray, scales_db: np.ndarray, share: np.ndarray,
             weights: np.ndarray, sd_ratio: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
     """Combine the predictions of several models to one mean and error scale (n,) [dB].
 
     Args:
-        members_db: (n, k) level predicted by each member [dB].
-        scales_db: (n, k) error scale of each member [dB].
+        predicted_db: (n, k) level predicted by each predictor [dB].
+        scales_db: (n, k) error scale of each predictor [dB].
         share: (n,) share of the far weights, see `far_share`.
         weights: (2, k) weights near measurements, and far from them.
         sd_ratio: see `Blend`.
     """
     scale_db = np.sqrt(combine(np.square(scales_db), share, weights))
-    return combine(members_db, share, weights), scale_db * sd_factor(share, sd_ratio)
+    return combine(predicted_db, share, weights), scale_db * sd_factor(share, sd_ratio)
 
 
 @dataclass(frozen=True, eq=False)
 class Blend:
-    """Members that predict beside the named effects, and the weights of all members.
+    """Predictors beside the named effects, and the weights of all of them.
 
     Attributes:
-        weights: weight of each member near measurements, and far from them; both sum to one.
+        weights: weight of each predictor near measurements, and far from them; both sum to one.
         half_m: distance from measurements of equal near and far weights [m].
-        sd_ratio: error scale over the weighted root mean square of the members' scales, near
+        sd_ratio: error scale over the weighted root mean square of the predictors' scales, near
             measurements, and far from them.
         receivers_move: True: receivers move and devices are fixed; False: the other way round.
         measured_m: (p, 3) measured positions of the moving end [m].
@@ -114,8 +114,8 @@ class Blend:
                 away_m[rows] = cKDTree(known_m).query(moving_m[rows])[0]
         return away_m
 
-    def members_db(self, links: Links, mean_db: np.ndarray, scale_db: np.ndarray, dof: float,
-                   rest: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    def predictions(self, links: Links, mean_db: np.ndarray, scale_db: np.ndarray, dof: float,
+                    shadowing: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Return level (n, k) and error scale (n, k) [dB] of each model, in the order of `weights`.
 
         Args:
@@ -123,32 +123,32 @@ class Blend:
             mean_db: (n,) level by channel and named effects [dB].
             scale_db: (n,) its error scale, also taken for trees [dB].
             dof: degrees of freedom of the errors.
-            rest: (n,) interpolated residual [error scales], and (n,) share of the scale that then
-                remains.
+            shadowing: (n,) interpolated residual [error scales], and (n,) share of the scale that
+                then remains.
         """
-        members = {NAMED: mean_db, REST: mean_db + rest[0] * scale_db}
-        scales = dict.fromkeys(self.weights, scale_db) | {REST: rest[1] * scale_db}
+        levels = {NAMED: mean_db, SHADOWED: mean_db + shadowing[0] * scale_db}
+        scales = dict.fromkeys(self.weights, scale_db) | {SHADOWED: shadowing[1] * scale_db}
         if self.forests:
             features = link_features(self._declared(links), receivers=False)
             for name, forest in self.forests.items():
                 predicted = forest.predict(features)
-                members[name] = predicted if name in LEVEL_FORESTS \
+                levels[name] = predicted if name in LEVEL_FORESTS \
                     else mean_db + predicted * scale_db
         for name, law in self.laws.items():
             law_db, sd_db = law.predict(links.geometry)
-            members[name] = law_db + law.declared_db(links)
+            levels[name] = law_db + law.declared_db(links)
             scales[name] = sd_db / sd_of_scale(dof)
-        return (np.column_stack([members[name] for name in self.weights]),
+        return (np.column_stack([levels[name] for name in self.weights]),
                 np.column_stack([scales[name] for name in self.weights]))
 
     def apply(self, links: Links, mean_db: np.ndarray, scale_db: np.ndarray, dof: float,
-              rest: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and error scale (n,) [dB] of the blend; arguments as in `members_db`.
+              shadowing: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Return mean and error scale (n,) [dB] of the blend; arguments as in `predictions`.
 
         The limit of detection is ignored.
         """
         share = far_share(self.away_m(links), self.half_m)
-        return blended(*self.members_db(links, mean_db, scale_db, dof, rest), share,
+        return blended(*self.predictions(links, mean_db, scale_db, dof, shadowing), share,
                        np.transpose(list(self.weights.values())), self.sd_ratio)
 
     def weighted(self, weights: dict[str, tuple[float, float]], half_m: float,
@@ -221,7 +221,8 @@ class Blend:
         weights = {name: (require_number({name: near}, name, 0, 1),
                           require_number({name: far}, name, 0, 1))
                    for name, (near, far) in settings["weights"].items()}
-        require_names("weights", set(weights) | {NAMED, REST}, {NAMED, REST, *forests, *laws})
+        require_names("weights", set(weights) | {NAMED, SHADOWED},
+                      {NAMED, SHADOWED, *forests, *laws})
         if not np.allclose(np.sum(list(weights.values()), axis=0), 1.0, atol=1e-6):
             raise ValueError("weights do not sum to one")
         near, far = settings["sd_ratio"]

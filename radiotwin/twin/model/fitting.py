@@ -300,7 +300,7 @@ def _best_addition(fit: Fit, effect: Effect, like: Effect | None,
     if like is None or not exactly or fit.objective - best.objective < MIN_GAIN_NATS:
         return best
     best = with_exact_levels(best)
-    near = _near(fit, like)
+    near = _refine_in_fold(fit, like)
     return near if near.objective < best.objective else best
 
 
@@ -309,9 +309,9 @@ def _best_along_paths(fit: Fit, without: Fit) -> Fit:
 
     The search is repeated while each time gains MIN_EXACT_GAIN_NATS.
     """
-    best = with_exact_levels(_over_known_paths(fit))
+    best = with_exact_levels(_refine_over_cached_paths(fit))
     if not _is_exact(best) and best.channel.follows_paths:
-        best = _exactly_beside(best)
+        best = _refine_exactly(best)
     variation = best.effects[-1].variation()
     if variation is None or not variation.follows_paths:
         return best
@@ -346,7 +346,7 @@ def _is_exact(fit: Fit) -> bool:
     return last.is_same(last.exactly())
 
 
-def _exactly_beside(fit: Fit) -> Fit:
+def _refine_exactly(fit: Fit) -> Fit:
     """Search the last effect's parameters again, with exact levels, from traced paths.
 
     Starts at the optimum of quick levels, for the case that exact ones are worse there. Only for
@@ -362,7 +362,7 @@ def _exactly_beside(fit: Fit) -> Fit:
     return exact if exact.objective < fit.objective else fit
 
 
-def _over_known_paths(fit: Fit, is_near: bool = False) -> Fit:
+def _refine_over_cached_paths(fit: Fit, is_near: bool = False) -> Fit:
     """Search the last effect's parameters without tracing: cached paths give nearly exact levels.
 
     An evaluation takes milliseconds, for example if an obstacle blocks some of the cached paths.
@@ -381,7 +381,7 @@ def _over_known_paths(fit: Fit, is_near: bool = False) -> Fit:
     return exactly if exactly.objective < fit.objective else fit
 
 
-def _near(fit: Fit, like: Effect) -> Fit:
+def _refine_in_fold(fit: Fit, like: Effect) -> Fit:
     """Fit an effect in a fold with exact levels, near the parameters `like` found on all links.
 
     Each parameter is tried NEAR_SHARE of its step to both sides, then all improvements together. As
@@ -394,7 +394,7 @@ def _near(fit: Fit, like: Effect) -> Fit:
     if variation is None:
         return best
     if not variation.follows_paths:
-        return _over_known_paths(best, is_near=True)
+        return _refine_over_cached_paths(best, is_near=True)
     start_nats, numbers = best.objective, variation.values.copy()
     for number, step in enumerate(variation.steps):
         least_nats = start_nats

@@ -302,7 +302,8 @@ class Fit(FitResult):
         """Return residuals (m,) of the training links in error scales, clipped to MAX_REST_Z."""
         return np.clip(self.view.residual_db / self.view.scale_db, -MAX_REST_Z, MAX_REST_Z)
 
-    def rest(self, seed: int, like: CorrelatedShadowing | None = None) -> CorrelatedShadowing:
+    def fit_shadowing(self, seed: int,
+                      like: CorrelatedShadowing | None = None) -> CorrelatedShadowing:
         """Fit `shadowing`, the interpolation of the training links' residuals over space.
 
         Args:
@@ -504,18 +505,18 @@ class FittedModel:
 
     def predict(self, links: Links) -> Prediction:
         """Predict mean, standard deviation and detection probability of links."""
-        law = self.law(links)
+        law = self.reading_law(links)
         return Prediction(law.mean_db, law.sd_db, law.detection_probability, law.reading_db)
 
-    def law(self, links: Links) -> ReadingLaw:
+    def reading_law(self, links: Links) -> ReadingLaw:
         """Return the predictive distribution of the readings of any links, with all effects."""
         if not self.is_channel_alone:
-            return self.law_on(self.on_links(links))
+            return self.reading_law_on(self.on_links(links))
         mean_db, sd_db = self.channel.predict(links.geometry)
         return ReadingLaw(mean_db + self.channel.declared_db(links), sd_db / sd_of_scale(self.dof),
                           links.limit_db, self.dof)
 
-    def law_on(self, fit: Fit) -> ReadingLaw:
+    def reading_law_on(self, fit: Fit) -> ReadingLaw:
         """Return the predictive distribution of a fit's links, with interpolated residuals.
 
         Twins use it for maps, folds for held-out links.
@@ -524,15 +525,15 @@ class FittedModel:
             fit: this model applied to n links, see `on_links`.
         """
         mean_db, scale_db, unheard_db = self._by_effects(fit)
-        shift, remaining = rest = self._shadowing_at(fit.links)
+        shift, remaining = shadowing = self._shadowing_at(fit.links)
         if self.blend is not None:
-            mean_db, scale_db = self.blend.apply(fit.links, mean_db, scale_db, self.dof, rest)
+            mean_db, scale_db = self.blend.apply(fit.links, mean_db, scale_db, self.dof, shadowing)
         else:
             mean_db, scale_db = mean_db + shift * scale_db, scale_db * remaining
         return ReadingLaw(mean_db, np.hypot(scale_db, unheard_db), fit.model.limit_db, self.dof,
                           fit.model.losses)
 
-    def members_on(self, fit: Fit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def predictions_on(self, fit: Fit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the predictions of all models of the blend, for a fit's n links.
 
         Returns:
@@ -541,8 +542,8 @@ class FittedModel:
         """
         assert self.blend is not None
         mean_db, scale_db, unheard_db = self._by_effects(fit)
-        return *self.blend.members_db(fit.links, mean_db, scale_db, self.dof,
-                                      self._shadowing_at(fit.links)), unheard_db
+        return *self.blend.predictions(fit.links, mean_db, scale_db, self.dof,
+                                       self._shadowing_at(fit.links)), unheard_db
 
     def _by_effects(self, fit: Fit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return `Fit.reading_parts`; unheard devices get mean offset and spread of the others."""

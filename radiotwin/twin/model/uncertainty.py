@@ -26,7 +26,7 @@ STEP_SHARES = (0.02, 3.0)  # least and greatest width of a secant, over `Variati
 
 
 @dataclass(frozen=True, eq=False)
-class Secant:
+class ReadingDerivative:
     """Derivative of n readings with respect to one parameter, by finite differences.
 
     Attributes:
@@ -43,12 +43,12 @@ class Secant:
     precision: float = 0.0
     sides: tuple[float, float] = (1.0, 1.0)
 
-    def moved(self, known: np.ndarray, wanted: np.ndarray) -> Secant:
-        """Return the derivative for another subset of m links; 0 on links that this secant lacks.
+    def moved(self, known: np.ndarray, wanted: np.ndarray) -> ReadingDerivative:
+        """Return the derivative for another subset of m links; 0 on links that this one lacks.
 
         Args:
-            known: (m,) bool, the links of this secant.
-            wanted: (m,) bool, the links of the returned secant.
+            known: (m,) bool, the links of this derivative.
+            wanted: (m,) bool, the links of the returned derivative.
         """
         def on_wanted(values: np.ndarray) -> np.ndarray:
             on_all = np.zeros(len(known))
@@ -66,31 +66,31 @@ class Linearised:
         fit: the fit, with quick levels for effects that are varied with quick levels.
         design_effect: design effect of its training links.
         variations: variable parameters of each effect; None: it has none.
-        secants: secants of each effect's parameters, on the training links.
+        derivatives: derivatives of each effect's parameters, on the training links.
     """
 
     fit: Fit
     design_effect: float
     variations: list[Variation | None]
-    secants: list[list[Secant]]
+    derivatives: list[list[ReadingDerivative]]
 
 
-def linearise(fit: Fit, known: Mapping[int, list[Secant]] | None = None) -> Linearised:
+def linearise(fit: Fit, known: Mapping[int, list[ReadingDerivative]] | None = None) -> Linearised:
     """Linearise the readings of a model's training links in the parameters of its effects.
 
     Args:
         fit: fit with effects.
-        known: secants computed before, by index of the effect.
+        known: derivatives computed before, by index of the effect.
     """
     variations = [effect.variation() for effect in fit.effects]
-    fit = _as_varied(fit, variations)
+    fit = _with_varied_effects(fit, variations)
     # Priors are weighted by the design effect of all links, as if these were independent.
     design_effect = fit.view.design_effect
     known = known or {}
-    secants = [known[number] if number in known
-               else _secants(fit, number, variation, design_effect)
-               for number, variation in enumerate(variations)]
-    return Linearised(fit, design_effect, variations, secants)
+    derivatives = [known[number] if number in known
+                   else _derivatives(fit, number, variation, design_effect)
+                   for number, variation in enumerate(variations)]
+    return Linearised(fit, design_effect, variations, derivatives)
 
 
 def estimates(linearised: Linearised) -> list[Estimate]:
@@ -100,7 +100,7 @@ def estimates(linearised: Linearised) -> list[Estimate]:
     over these clusterings counts.
     """
     fit = linearised.fit
-    scores = _scores(fit, [secant for of_effect in linearised.secants for secant in of_effect],
+    scores = _scores(fit, [each for of_effect in linearised.derivatives for each in of_effect],
                      linearised.design_effect)
     links = fit.links.select(fit.train)
     clusterings = [evidence_blocks(links), places(links)]
@@ -109,20 +109,20 @@ def estimates(linearised: Linearised) -> list[Estimate]:
     covariances = scores.covariances(clusterings)
     all_sd = np.sqrt(np.max([np.diag(covariance) for covariance in covariances], axis=0))
     first, found = len(fit.coefficients), []
-    for columns, secants, variation in zip(fit.model.coefficient_slices, linearised.secants,
+    for columns, derivatives, variation in zip(fit.model.coefficient_slices, linearised.derivatives,
                                            linearised.variations, strict=True):
-        sd = all_sd[first:first + len(secants)]
+        sd = all_sd[first:first + len(derivatives)]
         if variation is not None:
             sd = np.hypot(sd, variation.resolution_sd)
-        sides = np.reshape([secant.sides for secant in secants], (-1, 2)).T
+        sides = np.reshape([each.sides for each in derivatives], (-1, 2)).T
         found.append(Estimate(fit.coefficients[columns],
                               [covariance[columns, columns] for covariance in covariances],
                               sd * sides))
-        first += len(secants)
+        first += len(derivatives)
     return found
 
 
-def _as_varied(fit: Fit, variations: list[Variation | None]) -> Fit:
+def _with_varied_effects(fit: Fit, variations: list[Variation | None]) -> Fit:
     """Return the fit with every effect as its `variation` builds it, fitted again if that differs.
 
     A variation mostly takes quick levels, from the channel's fast law, in place of exact ones, from
@@ -137,8 +137,8 @@ def _as_varied(fit: Fit, variations: list[Variation | None]) -> Fit:
     return fit.with_effects(effects)
 
 
-def _secants(fit: Fit, number: int, variation: Variation | None,
-             design_effect: float) -> list[Secant]:
+def _derivatives(fit: Fit, number: int, variation: Variation | None,
+                 design_effect: float) -> list[ReadingDerivative]:
     """Compute the derivative of the readings in each parameter of an effect, by apt steps.
 
     A step is about as wide as the parameter's uncertainty, which a first step tells.
@@ -149,17 +149,18 @@ def _secants(fit: Fit, number: int, variation: Variation | None,
     # Along paths, begin with the steps that folds use, too: their levels are cached.
     steps = (NEAR_SHARE if variation.follows_paths else 1.0) * variation.steps
     for i, (step, usual) in enumerate(zip(steps.tolist(), variation.steps.tolist(), strict=True)):
-        secant = _secant(fit, number, variation, i, step)
-        information = _information(fit, secant)
-        sd = np.sqrt(design_effect / (information + design_effect * secant.precision))
+        derivative = _derivative(fit, number, variation, i, step)
+        information = _information(fit, derivative)
+        sd = np.sqrt(design_effect / (information + design_effect * derivative.precision))
         wanted = float(np.clip(sd, *(share * usual for share in STEP_SHARES)))
         if not 0.5 < wanted / step < 2.0:
-            secant = _secant(fit, number, variation, i, wanted)
-        found.append(secant)
+            derivative = _derivative(fit, number, variation, i, wanted)
+        found.append(derivative)
     return found
 
 
-def _secant(fit: Fit, number: int, variation: Variation, i: int, step: float) -> Secant:
+def _derivative(fit: Fit, number: int, variation: Variation, i: int, step: float
+                ) -> ReadingDerivative:
     """Compute the derivative of readings in parameter `i` of an effect, by steps to both sides."""
     model = fit.model
     effect, problem = model.effects[number], model.training
@@ -186,27 +187,27 @@ def _secant(fit: Fit, number: int, variation: Variation, i: int, step: float) ->
         sides.append(change / moved_by)
         priors.append(other.neg_log_prior() - prior)
     if not sides:
-        return Secant(np.zeros(n), np.zeros(n), np.zeros(n))
+        return ReadingDerivative(np.zeros(n), np.zeros(n), np.zeros(n))
     mean_db, log_scale, score = np.mean(sides, axis=0)
     # A normal prior rises by (step / sd)² / 2 to each side on average; bounds are a uniform prior.
     precision = max(2 * float(np.mean(priors)) / step**2, 0.0)
     precision += 12.0 / (variation.high[i] - variation.low[i])**2
-    secant = Secant(mean_db, log_scale, score, precision)
+    derivative = ReadingDerivative(mean_db, log_scale, score, precision)
     if len(sides) < 2:
-        return secant
-    informations = [_information(fit, Secant(side[0], side[1], side[2])) + precision
+        return derivative
+    informations = [_information(fit, ReadingDerivative(side[0], side[1], side[2])) + precision
                     for side in sides]
     below, above = (float(np.sqrt(np.mean(informations) / information))
                     for information in informations)
-    return replace(secant, sides=(below, above))
+    return replace(derivative, sides=(below, above))
 
 
-def _information(fit: Fit, secant: Secant) -> float:
+def _information(fit: Fit, derivative: ReadingDerivative) -> float:
     """Return the Fisher information of all links on one parameter, if all others are known."""
     problem = fit.model.training
     curvature, scale_curvature = _curvatures(problem, problem.predict(fit))[2:]
-    return float((curvature * secant.mean_db**2 + scale_curvature * secant.log_scale**2
-                  + secant.score**2).sum())
+    return float((curvature * derivative.mean_db**2 + scale_curvature * derivative.log_scale**2
+                  + derivative.score**2).sum())
 
 
 def _curvatures(problem: CensoredRegression, predicted: Linearisation,
@@ -223,11 +224,11 @@ def _curvatures(problem: CensoredRegression, predicted: Linearisation,
             2 * problem.dof / (problem.dof + 3) * seen)
 
 
-def _scores(fit: Fit, secants: list[Secant], design_effect: float) -> Scores:
+def _scores(fit: Fit, derivatives: list[ReadingDerivative], design_effect: float) -> Scores:
     """Return each link's score (derivative of its log-likelihood), its information, and priors.
 
     Columns are all coefficients, those of the channel first, then the varied parameters
-    (`secants`).
+    (`derivatives`).
     """
     problem = fit.model.training
     predicted = problem.predict(fit)
@@ -236,7 +237,7 @@ def _scores(fit: Fit, secants: list[Secant], design_effect: float) -> Scores:
         law = law * predicted.law_slope[:, None]
     n = len(law)
     mean, log_scale, score = (
-        np.reshape([getattr(secant, name) for secant in secants], (len(secants), n)).T
+        np.reshape([getattr(each, name) for each in derivatives], (len(derivatives), n)).T
         for name in ("mean_db", "log_scale", "score"))
     growth = np.broadcast_to(predicted.growth, n)[:, None]
     passed = np.broadcast_to(predicted.slope, n)[:, None]
@@ -255,7 +256,7 @@ def _scores(fit: Fit, secants: list[Secant], design_effect: float) -> Scores:
         scored = scored + columns
         roots.append(columns)
     coefficient_precision = 1.0 / np.square(problem.prior_sd_db)
-    precision = design_effect * np.array([secant.precision for secant in secants])
+    precision = design_effect * np.array([each.precision for each in derivatives])
     root = vstack(roots, format="csr") if issparse(roots[0]) else np.vstack(roots)
     return Scores(scored, root, np.concatenate([coefficient_precision, precision]),
                   np.concatenate([coefficient_precision, design_effect * precision]))

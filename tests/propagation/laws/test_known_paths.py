@@ -44,7 +44,7 @@ def test_without_a_box_all_power_is_there(geometry):
     known, gains = KnownPaths(geometry, geometry.city), interaction_gains(geometry)
     far = UprightBox((5000.0, 5000.0), (10.0, 10.0), 0.3, 20.0)
     for rows in (np.arange(7), np.arange(RECEIVERS)):  # some at first, then the others
-        power = known.past(far, rows)
+        power = known.powers_with_box(far, rows)
         np.testing.assert_array_equal(power.others_past, power.others)
         np.testing.assert_allclose(power.direct, gains[rows, 0], rtol=1e-12)
         share = power.others / gains[rows, 1:].sum(axis=1)
@@ -54,13 +54,13 @@ def test_without_a_box_all_power_is_there(geometry):
 
 def test_a_box_blocks_the_paths_that_go_through_it(geometry):
     known, rng = KnownPaths(geometry, geometry.city), np.random.default_rng(1)
-    known.past(UprightBox((0.0, 0.0), (1.0, 1.0), 0.0, 1.0), np.arange(RECEIVERS))
+    known.powers_with_box(UprightBox((0.0, 0.0), (1.0, 1.0), 0.0, 1.0), np.arange(RECEIVERS))
     link, power, points_m, count = known._paths
     some, blocked = rng.choice(len(link), 20, replace=False), 0
     for _ in range(8):
         box = UprightBox(tuple(rng.uniform([20, -30], [120, 55])), tuple(rng.uniform(2, 15, 2)),
                          rng.uniform(-1.5, 1.5), rng.uniform(5, 35))
-        lost = known.past(box, np.arange(RECEIVERS))
+        lost = known.powers_with_box(box, np.arange(RECEIVERS))
         of_link = np.zeros(RECEIVERS)
         for path in some:
             less, more = goes_through(points_m[path, :count[path]].astype(float), box)
@@ -69,7 +69,7 @@ def test_a_box_blocks_the_paths_that_go_through_it(geometry):
             alone = KnownPaths(geometry, geometry.city)
             alone._paths = tuple(each[path:path + 1] for each in known._paths)
             alone._is_followed[:] = True
-            past = alone.past(box, np.array([link[path]])).others_past
+            past = alone.powers_with_box(box, np.array([link[path]])).others_past
             assert past == pytest.approx(0.0 if less else power[path])
             blocked += less
             of_link[link[path]] += power[path] * less
@@ -78,5 +78,5 @@ def test_a_box_blocks_the_paths_that_go_through_it(geometry):
 
 
 def test_of_no_link_nothing_is_followed(geometry):
-    power = KnownPaths(geometry, geometry.city).past(UprightBox((60.0, 0.0), (9.0, 9.0), 0.0, 60.0), np.arange(0))
+    power = KnownPaths(geometry, geometry.city).powers_with_box(UprightBox((60.0, 0.0), (9.0, 9.0), 0.0, 60.0), np.arange(0))
     assert [len(each) for each in power] == [0, 0, 0]

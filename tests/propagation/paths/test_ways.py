@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from radiotwin.propagation.paths.candidates import CandidateSearch, _open_ways
+from radiotwin.propagation.paths.candidates import CandidateSearch, _open_paths_to_edges
 from radiotwin.propagation.paths.pruning import narrow, open_window
 
 
@@ -56,7 +56,7 @@ def test_only_edges_that_the_device_sees_are_tried(city_of):
     city = city_of((0, -20, 5, 20, 30), (30, -10, 40, 10, 10), (30, 100, 40, 120, 10))
     search = CandidateSearch(city, 1)
     everything = np.arange(len(search.surfaces.edges))
-    ways = _open_ways(city, search.surfaces, np.full((len(everything), 1), -1), everything, np.array([-20.0, 0, 1.5]))
+    ways = _open_paths_to_edges(city, search.surfaces, np.full((len(everything), 1), -1), everything, np.array([-20.0, 0, 1.5]))
     middle_m = search.facets.edge_ends_m[ways.edge].mean(axis=1)
     assert set(np.unique(ways.edge)) < set(everything) and len(np.unique(ways.edge)) == len(ways.edge)
     hidden = (middle_m[:, 0] > 25) & (np.abs(middle_m[:, 1]) < 50)
