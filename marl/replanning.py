@@ -60,9 +60,9 @@ class ReplanPolicy:
     def start(self, mission: Mission, flights: int) -> None:
         """See `marl.flights.Policy`; the map of the mission that is flown is not read."""
         self._slot = 0
-        minds = 1 if self._linked else self._mission.uavs
+        number = 1 if self._linked else self._mission.uavs
         self._flights = [[_Knowledge(self, range(self._mission.uavs) if self._linked else [u])
-                          for u in range(minds)] for _ in range(flights)]
+                          for u in range(number)] for _ in range(flights)]
         first, uavs = self._first, self._mission.uavs
         self._tour = np.tile(first.tour, (flights, 1, 1, 1))
         self._count = np.tile(first.visits, (flights, 1))
@@ -70,11 +70,11 @@ class ReplanPolicy:
 
     def act(self, frame: Frame) -> np.ndarray:
         """See `marl.flights.Policy`."""
-        for flight, minds in enumerate(self._flights):
+        for flight, of_uavs in enumerate(self._flights):
             if frame.battery[flight].any():
-                for knowledge in minds:
+                for knowledge in of_uavs:
                     knowledge.receive(frame, flight, self._slot)
-                if len(minds) > 1:
+                if len(of_uavs) > 1:
                     self._meet(frame, flight)
                 if self._slot and self._slot % self._every == 0:
                     self._search(frame, flight)
@@ -85,18 +85,18 @@ class ReplanPolicy:
 
     def _meet(self, frame: Frame, flight: int) -> None:
         """Exchange readings and planned tours between UAVs whose SNR reaches the threshold."""
-        mission, minds = self._mission, self._flights[flight]
+        mission, of_uavs = self._mission, self._flights[flight]
         cell = frame.cell[flight].astype(float) * mission.step_m
-        for u, knowledge in enumerate(minds):
+        for u, knowledge in enumerate(of_uavs):
             for v in range(u):
                 if not (frame.battery[flight, u] and frame.battery[flight, v]):
                     continue
                 away_m = np.hypot(np.hypot(*(cell[u] - cell[v])),
                                   mission.altitude_m[u] - mission.altitude_m[v])
                 if uav_snr_db(mission, float(away_m)) >= mission.threshold_db:
-                    knowledge.learn_from(minds[v])
-                    minds[v].learn_from(knowledge)
-                    for one, other in ((knowledge, v), (minds[v], u)):
+                    knowledge.learn_from(of_uavs[v])
+                    of_uavs[v].learn_from(knowledge)
+                    for one, other in ((knowledge, v), (of_uavs[v], u)):
                         one.others[other] = (
                             self._slot, frame.cell[flight, other].astype(np.int64),
                             int(frame.battery[flight, other]),
