@@ -69,7 +69,11 @@ class ReplanPolicy:
         self._reached, self._hovered = np.zeros((2, flights, uavs), dtype=np.int64)
 
     def act(self, frame: Frame) -> np.ndarray:
-        """See `marl.flights.Policy`."""
+        """Return the action of every UAV of every flight: a step along its planned tour.
+
+        Before that, UAVs learn from what they heard, UAVs in reach exchange it, and every few slots
+        the tours are planned again (see `marl.flights.Policy`).
+        """
         for flight, of_uavs in enumerate(self._flights):
             if frame.battery[flight].any():
                 for knowledge in of_uavs:

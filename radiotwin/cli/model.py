@@ -167,7 +167,7 @@ def compare(
         help="Number of the last flights that are held out of the fits.")] = 1,
     devices: DeviceTable = None,
     paths: Annotated[bool, typer.Option(
-        "--paths", help="Compare the model paths, too, which follows paths over the 3D map. Takes "
+        "--paths", help="Also compare the model `paths` (paths followed over the 3D map). Takes "
                         "minutes.")] = False,
     also: Annotated[list[Path] | None, typer.Option(
         help="A twin's folder, or (with --truth) a radio map, to compare with the models; may be "

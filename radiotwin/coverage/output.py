@@ -73,7 +73,8 @@ class Legend:
     def classes(self, values: np.ndarray) -> np.ndarray:
         """Return the class index of each value (0: the highest class), any shape; -1 for NaN.
 
-        Values of the best-server raster are indices of transmitters, and their own classes.
+        A legend without lower bounds, that of the best server, has one class per transmitter: its
+        values are the indices of transmitters already and are returned as integers.
         """
         if not self.lower:
             return values.astype(np.int32)

@@ -335,7 +335,7 @@ class Effect(ABC):
         return None
 
     def same_as(self, links: Links, parameters: Mapping[str, Parameter]) -> list[str]:
-        """List the other effects that would explain these links equally well, by name.
+        """List the effects that would explain these links equally well by name; default: none.
 
         E.g. an offset of a device that only one receiver heard may as well be that receiver's.
 

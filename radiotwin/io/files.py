@@ -380,9 +380,12 @@ def _temporaries_place(path: Path) -> Path:
 
 
 def _swap(new: Path, path: Path, names: Collection[str] | None) -> None:
-    """Replace the folder `path`, or the `names` in it, by the content of `new`; all or nothing."""
+    """Replace the folder `path` by the folder `new`; if a move fails, undo those made before.
+
+    With `names`, files in `path` that match none of them and are not in `new` stay.
+    """
     inside = _temporaries_place(path) != path
-    with deferred(), _locked(path if inside else path.parent):  # another process may, too
+    with deferred(), _locked(path if inside else path.parent):  # another process may swap it, too
         if not inside:
             try:
                 os.replace(new, path)  # nothing is there, or an empty folder

@@ -30,7 +30,10 @@ NOT_LOOKED_FOR, LACKING = "not looked for: ", "there is no "  # a reason, and ho
 
 
 def closeloop_summary(report: dict) -> str:
-    """Summarise a close-loop in a few sentences: deviating links, their causes, and the error.
+    """Summarise what `close-loop` found in a few sentences.
+
+    They say which links deviate from the model, the probable causes, and the error on held-out
+    links before and after.
 
     Args:
         report: content of `closeloop.json`.

@@ -154,7 +154,7 @@ def thread_variables(cores: int) -> dict[str, str]:
 
 @contextmanager
 def _noted(outcome: Outcome) -> Iterator[None]:
-    """Collect the warnings and log records of the block in an outcome, in place."""
+    """Add the user warnings and log records of a `with` block to the messages of `outcome`."""
     handler = _Noting(outcome)
     root = logging.getLogger()
     root.addHandler(handler)

@@ -361,7 +361,11 @@ def _difference(found: ReceiverDifference, links: Links) -> dict[str, Any]:
 
 
 def _shadowing(trial: Trial, model: CrossFit, rank: int) -> dict[str, Any]:
-    """Return the `EffectRecord` of interpolated shadowing."""
+    """Return the entry of interpolated shadowing under `effects` of `closeloop.json`.
+
+    Its parameters are the correlation length, the shares of the variance that are correlated over
+    positions and common to a receiver, and the standard deviation; they have no intervals.
+    """
     shadowing = model.whole.shadowing
     assert shadowing is not None
     field, relatives = shadowing.field, shadowing.relatives

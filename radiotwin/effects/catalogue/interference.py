@@ -152,9 +152,10 @@ def _reading_m(links: Links) -> np.ndarray:
 
 def _path_gain_db(links: Links, position_m: Sequence[float] | np.ndarray,
                   level_at: LevelAt | None) -> np.ndarray:
-    """Compute the gain (n,) from an emitter near the ground to the end that reads each level [dB].
+    """Compute the gain (n,) from an emitter near the ground to the measuring end of each link [dB].
 
-    By the channel, or without `level_at` in free space, relative to the gain at `REFERENCE_M`.
+    `level_at` predicts it with the fitted channel model. Without it: free space, in dB relative to
+    the gain at a distance of `REFERENCE_M`.
     """
     ground_m = 0.0 if links.city is None else float(links.city.ground_height_m(*position_m))
     emitter_m = np.array([*position_m, ground_m + HEIGHT_M])

@@ -254,15 +254,19 @@ class LockLoss(DetectionEffect):
 
 
 def _blank_share(view: ResidualView, rows: np.ndarray) -> float | None:
-    """Estimate which share of a receiver's links (rows) is undetected at random; None: unsure."""
+    """Estimate the probability that a receiver loses a link (rows) whatever its level.
+
+    By maximum likelihood, beside links that are undetected as their level is below the limit. None
+    if losses of that kind do not explain the blanks clearly better.
+    """
     links = view.links
     blank = np.isnan(links.level_db[rows])
     if not blank.any() or not np.isfinite(links.limit_db[rows]).all():
         return None
     margin = (links.limit_db[rows] - view.mean_db[rows]) / view.scale_db[rows]
     probability, nats = _likeliest(stdtr(DOF, margin), blank)
-    # If the strongest links do not gain, the limit of detection is higher; if most devices do not,
-    # there is an obstacle.
+    # If the likelihood of the strongest links does not rise, the limit of detection is higher than
+    # declared; if that of most devices does not, an obstacle explains the blanks.
     strong = margin <= np.quantile(margin, STRONGEST)
     gains = (nats.sum() > MIN_NATS * view.design_effect and nats[strong].sum() > 0
              and _most_devices_gain(links.device[rows], nats))

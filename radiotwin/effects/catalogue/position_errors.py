@@ -292,7 +292,7 @@ class ReceiverPositionError(_PositionError):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
-        """Propose the shift of one receiver's positions whose links gain most from it."""
+        """Propose the receiver and the shift of its positions that raise the likelihood most."""
         moves = [sign * size_m * np.array(axis) for axis in RECEIVER_AXES
                  for size_m in RECEIVER_MOVES_M for sign in (-1, 1)]
         known = set(view.found_params(self.name, "receiver"))

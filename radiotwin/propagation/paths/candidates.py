@@ -347,7 +347,8 @@ def _first_facets(city: CityMap, facets: CityFacets, start_m: np.ndarray, direct
                   ) -> np.ndarray:
     """Return distance [m] and index of the first facet that each ray hits, as (2, n).
 
-    The index is -1 if a ray hits nothing, or the back of a facet. Flat ground is infinite.
+    The index is -1 if a ray hits nothing, or the back of a facet. Flat ground is the last facet, a
+    plane without edges.
     """
     distance_m, face, cosine = city.first_hits_towards(start_m, direction)
     facet = np.where(face >= 0, facets.of_face[face], -1)
