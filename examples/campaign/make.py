@@ -21,6 +21,7 @@ from shapely.geometry import Point, Polygon, box, mapping
 import radiotwin as rt
 from radiotwin.geo import to_geographic
 from radiotwin.io.forms import Origin
+from radiotwin.scene.build import BuildOptions
 from radiotwin.scene.readers import build_scene_from_map
 from radiotwin.trace.run import trace_gains
 
@@ -51,7 +52,7 @@ def main(folder: Path, seed: int = 7) -> None:
     with tempfile.TemporaryDirectory() as name:
         write_map([*town, (NEW_BUILDING, NEW_HEIGHT_M)], Path(name) / "truth.geojson")
         build_scene_from_map(Path(name) / "truth.geojson", Path(name) / "truth",
-                             rt.BuildOptions(frequency_hz=FREQUENCY_HZ, origin=ORIGIN))
+                             BuildOptions(frequency_hz=FREQUENCY_HZ, origin=ORIGIN))
         gain_db = trace_gains(rt.Scene.load(Path(name) / "truth"), node_m, position_m,
                               rt.SolverSettings.of_quality("default"))
     logs = []

@@ -132,7 +132,7 @@ def link_layer(run: Run) -> dict | None:
              **{name: pack(pd.Index(names).get_indexer(links[name]).astype(np.int32))
                 for name, names in ends.items()},
              "los": pack(los.astype(np.uint8)), "fields": fields}
-    if run.scene is not None and len(run.scene.city.faces) <= MAX_FACES:
+    if _has_paths(run):
         layer["paths"] = path_layer(run.scene, links)
     if "time_s" in links:
         since_s = links["time_s"] - links.groupby("flight")["time_s"].transform("min")
@@ -143,6 +143,12 @@ def link_layer(run: Run) -> dict | None:
         fields.append(_field("held-out links: measured level", "measured level",
                              links["measured_db"].to_numpy(dtype=float), "gain", unit))
     return layer
+
+
+def _has_paths(run: Run) -> bool:
+    """Return whether the page has paths of links: its map is small enough to follow them."""
+    return (run.scene is not None and len(run.scene.city.faces) <= MAX_FACES
+            and run.residuals is not None and not run.residuals.empty)
 
 
 def path_layer(scene: Scene, links: pd.DataFrame) -> dict:
@@ -169,13 +175,17 @@ def path_layer(scene: Scene, links: pd.DataFrame) -> dict:
     chosen = links.iloc[rows].assign(row=rows)
     found_link, found_m = [np.zeros(0, dtype=int)], [np.zeros((0, 3))]
     ends: list[int] = []
-    for _, group in chosen.groupby([f"device_{axis}_m" for axis in "xyz"], sort=False):
-        paths = paths_with_points(scene.city, position_m(group, "device")[0],
-                                  position_m(group, "receiver"), scene.config.radio.frequency_hz)
+    # One search follows paths to many ends from one; paths are the same either way.
+    start, end = sorted(("device", "receiver"),
+                        key=lambda name: len(np.unique(position_m(chosen, name), axis=0)))
+    forward = 1 if start == "device" else -1
+    for _, group in chosen.groupby([f"{start}_{axis}_m" for axis in "xyz"], sort=False):
+        paths = paths_with_points(scene.city, position_m(group, start)[0],
+                                  position_m(group, end), scene.config.radio.frequency_hz)
         strongest = pd.DataFrame({"link": paths.receiver, "power": -paths.power}).sort_values(
             ["link", "power"]).groupby("link").head(MAX_PATHS).index
         found_link.append(group["row"].to_numpy()[paths.receiver[strongest]])
-        found_m += [paths.points_m[path, :paths.points[path]] for path in strongest]
+        found_m += [paths.points_m[path, :paths.points[path]][::forward] for path in strongest]
         ends += paths.points[strongest].tolist()
     return {"link": pack(np.concatenate(found_link).astype(np.int32)),
             "end": pack(np.cumsum(ends).astype(np.int32)),
@@ -441,5 +451,5 @@ def marks(run: Run) -> list[str]:
         "Purple: what the close-loop found.": bool(found_layer(run)),
         f"A click on one of the {MAX_PATH_LINKS:,} links with the largest residuals also draws its "
         f"{MAX_PATHS} strongest paths by reflection and diffraction, over the map as given.":
-            run.scene is not None and run.residuals is not None}
+            _has_paths(run)}
     return [sentence for sentence, is_drawn in sentences.items() if is_drawn]

@@ -87,6 +87,8 @@ def fit_twin(measurements: Measurements | pd.DataFrame | Path | str, scene: Scen
         start.require_frame(scene)
         start.warn_of_another_scene(scene, scene.content_hash())
     channel = channel_named(CHEAP[0] if model == AUTO else model)
+    if channel is SegmentedNN:
+        require_torch()
     if not (measurements.is_anchor.any() or issubclass(channel, PublishedLaw)):
         raise BadInput(NO_ANCHOR)
     along_paths = channel in (ImagePaths, PathKriging)
@@ -112,9 +114,9 @@ def fit_twin(measurements: Measurements | pd.DataFrame | Path | str, scene: Scen
         except MissingPackage:
             models = tuple(name for name in CHEAP if name != SegmentedNN.name)
             locates = SegmentedLogDistance
-            warnings.warn(f"{SegmentedNN.name} is not among the models compared, and "
-                          f"{locates.name} locates devices in its place: it needs torch "
-                          "(`pip install 'radiotwin[nn]'`)", stacklevel=2)
+            replacement = f", and {locates.name} locates devices in its place" * (model == AUTO)
+            warnings.warn(f"{SegmentedNN.name} is not among the models compared{replacement}: it "
+                          "needs torch (`pip install 'radiotwin[nn]'`)", stacklevel=2)
         of_anchors = np.isin(links.device, sorted(links.anchors))
         geometry, level_db, limit_db = anchors_links(links)
         if model == AUTO and len(geometry):  # even if the best model does not use the map

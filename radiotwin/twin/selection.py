@@ -84,7 +84,10 @@ class HeldOut:
                                      limits_db[train], seed)
                 expected_db = mean_if_detected(*model.predict(links.select(test)), limits_db[test])
                 error_db[test] = level_db[test] - expected_db
-            square_db2[name] = error_db[detected]**2
+            if np.isfinite(error_db[detected]).all():  # a model without some levels is no choice
+                square_db2[name] = error_db[detected]**2
+        if not square_db2:
+            return None
         least = min(square_db2.values(), key=lambda square: float(square.mean()))
         block = _index_rows(np.column_stack([links.device, cell])[detected])
         as_good = tuple(name for name, square in square_db2.items() if np.mean(square - least)

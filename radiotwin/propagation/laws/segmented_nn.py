@@ -74,7 +74,7 @@ def require_torch() -> Any:
     """Import torch; raise MissingPackage if it is not installed."""
     return optional_package(
         "torch", "the channel model segmented_nn needs torch, which is not installed; install it "
-                 "with `pip install 'radiotwin[nn]'`, or take another --model")
+                 "with `pip install 'radiotwin[nn]'`, or take another channel model")
 
 
 @contextmanager

@@ -163,7 +163,7 @@ class Stage {
     const corners = [x0, x1].flatMap(x => [y0, y1].flatMap(y => [[x, y, 0], [x, y, top]]));
     this.middle = new THREE.Vector3((x0 + x1) / 2, (y0 + y1) / 2, 0.3 * top);
     [this.turn, this.lift] = from === "above" ? [-Math.PI / 2, Math.PI / 2 - 1e-3] : [-Math.PI / 2 + 0.45, 0.72];
-    this.far = 3 * Math.max(x1 - x0, y1 - y0);
+    this.far = 3 * Math.max(x1 - x0, y1 - y0, top);
     const filled = this.width < 500 ? 0.94 : 0.86;  // of the picture; numbers stand around
     for (let n = 0; n < 8; n++) {  // each step is nearer to the answer
       this.aim();

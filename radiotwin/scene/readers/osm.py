@@ -454,7 +454,7 @@ def _nodes(elements: OsmElements, subject: str, element: Mapping) -> list[int]:
             nodes[row:row + 1] = [elements.store_node(_position(subject, point), number)]
         elif row >= len(nodes):
             nodes.append(0)  # a node without a position
-    VERTICES.check(len(elements.positions), "the map")
+    VERTICES.check(len(elements.positions), subject)
     return nodes
 
 
