@@ -132,7 +132,7 @@ def link_layer(run: Run) -> dict | None:
              **{name: pack(pd.Index(names).get_indexer(links[name]).astype(np.int32))
                 for name, names in ends.items()},
              "los": pack(los.astype(np.uint8)), "fields": fields}
-    if _has_paths(run):
+    if run.scene is not None and _has_paths(run):
         layer["paths"] = path_layer(run.scene, links)
     if "time_s" in links:
         since_s = links["time_s"] - links.groupby("flight")["time_s"].transform("min")
