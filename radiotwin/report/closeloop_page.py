@@ -149,7 +149,7 @@ def _cards(report: dict) -> list[tuple[str, str]]:
             cards.append(("of that, repeats at a place", f"{number(parts_db[0])} dB"))
     inside = (report["error"].get("combined") or {}).get("in_90_percent_interval")
     if inside is not None:
-        cards.append(("held-out readings in its 90 % intervals", f"{100 * inside:.0f} %"))
+        cards.append(("held-out readings in 90 % intervals of the twin", f"{100 * inside:.0f} %"))
     return cards
 
 

@@ -348,9 +348,9 @@ def test_the_page_tells_how_far_intervals_can_be_trusted(tmp_path):
                   "advice": "kriging is worse"}
     error = report()["error"] | {"combined": SCORES | {"rmse_db": 1.9, "in_90_percent_interval": 0.874}}
     text = page(report(prediction=prediction, error=error), tmp_path)
-    assert "held-out readings in its 90 % intervals" in text and "87 %" in text
+    assert "held-out readings in 90 % intervals of the twin" in text and "87 %" in text
     error["combined"] = SCORES  # of a file that was written before
-    assert "in its 90 % intervals" not in page(report(prediction=prediction, error=error), tmp_path)
+    assert "90 % intervals" not in page(report(prediction=prediction, error=error), tmp_path)
 
 
 def test_times_since_1970_are_dates_and_no_other_quantity_is(tmp_path):
