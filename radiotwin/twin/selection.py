@@ -12,7 +12,7 @@ from radiotwin.inference.gaussian import Limit, limits_of, mean_if_detected
 from radiotwin.inference.held_out import deal_groups
 from radiotwin.links import LinkGeometry
 from radiotwin.propagation.laws import channel_named, fit_once
-from radiotwin.propagation.laws.base import BLOCK_M, MIN_DETECTED
+from radiotwin.propagation.laws.base import BLOCK_M, MIN_DETECTED, ground_blocks
 
 AUTO = "auto"
 HELD_OUT, LOCATED_BY = "held_out", "located_by"  # in the provenance of a twin
@@ -64,10 +64,10 @@ class HeldOut:
             rows = np.sort(rng.choice(len(flight), MAX_LINKS, replace=False))
             links, flight, level_db = links.select(rows), flight[rows], level_db[rows]
             limit_db = limit_db[rows] if isinstance(limit_db, np.ndarray) else limit_db
-        cell = np.floor(links.receiver_m[:, :2] / BLOCK_M).astype(np.int64)
         by, group = "flight", flight
         if len(np.unique(flight)) < MIN_FLIGHTS:
-            by, group = "block", _index_rows(cell)
+            square = np.floor(links.receiver_m[:, :2] / BLOCK_M).astype(np.int64)
+            by, group = "block", np.unique(square, axis=0, return_inverse=True)[1].ravel()
         fold = deal_groups(group, FOLDS, rng)
         detected, limits_db = np.isfinite(level_db), limits_of(limit_db, len(level_db))
         if len(np.unique(fold)) < 2 or min(
@@ -89,7 +89,7 @@ class HeldOut:
         if not square_db2:
             return None
         least = min(square_db2.values(), key=lambda square: float(square.mean()))
-        block = _index_rows(np.column_stack([links.device, cell])[detected])
+        block = ground_blocks(links.select(detected))
         as_good = tuple(name for name, square in square_db2.items() if np.mean(square - least)
                         <= max(standard_error(square - least, block), ALIKE * np.mean(least)))
         return cls(by, {name: float(np.sqrt(square.mean())) for name, square in square_db2.items()},
@@ -130,10 +130,6 @@ class HeldOut:
                 f"{model} has {self.rmse_db[model]:.2f} dB; take --model {self.best}, or --model "
                 f"{AUTO}")
 
-
-def _index_rows(rows: np.ndarray) -> np.ndarray:
-    """Return the index (n,) of each row (n, k) among the different ones."""
-    return np.unique(rows, axis=0, return_inverse=True)[1].ravel()
 
 
 def standard_error(value: np.ndarray, block: np.ndarray) -> float:
