@@ -13,7 +13,7 @@ class BadInput(Exception):
 
 
 class MissingPackage(BadInput):
-    """What was asked for needs a package that is not installed; the message says which extra."""
+    """The request needs a package that is not installed; the message names the extra to install."""
 
 
 class RunFailed(Exception):

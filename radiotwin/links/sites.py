@@ -138,7 +138,7 @@ def shared_names(links: Links) -> dict[int, str]:
 
 
 def inseparable_pairs(one: np.ndarray, other: np.ndarray) -> dict[int, int]:
-    """Find pairs of labels with exactly the same links: their errors cannot be told apart.
+    """Find pairs of labels with exactly the same links: their errors are indistinguishable.
 
     `one` and `other` (n,) are labels of links, such as device and receiver. Returned is a
     dictionary: label of `one` -> label of `other`.
@@ -152,8 +152,8 @@ def inseparable_pairs(one: np.ndarray, other: np.ndarray) -> dict[int, int]:
 def inseparable_end(links: Links, end: str, members: set[int]) -> str | None:
     """Return the other end (device or receiver) if a member and one there have the same links.
 
-    Errors of a device and a receiver with exactly the same detected links cannot be told apart.
-    `members` are indices at `end`. None: all can be told apart.
+    Errors of a device and a receiver with exactly the same detected links are indistinguishable.
+    `members` are indices at `end`. None: all are distinguishable.
     """
     other, heard = OTHER_END[end], np.isfinite(links.level_db)
     together = inseparable_pairs(getattr(links, end)[heard], getattr(links, other)[heard])

@@ -136,7 +136,7 @@ class EffectData:
 
 @dataclass(frozen=True, eq=False)
 class LoopData:
-    """What the figures of a close-loop draw.
+    """Data of a close-loop that its figures draw.
 
     Attributes:
         links: measured links, with the devices where the final model has them.

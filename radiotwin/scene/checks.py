@@ -85,7 +85,7 @@ def check_up_axis(surfaces: Surfaces, ground: np.ndarray) -> list[Problem]:
 def _has_ground_below(surfaces: Surfaces) -> bool:
     """Return whether ground covers 80 % of the city's plan and lies at its lowest level.
 
-    The level tells ground from a flat surface high up, such as a screen in a room.
+    The level distinguishes ground from a flat surface high up, such as a screen in a room.
     """
     ground = surfaces.ground_faces()
     size = np.ptp(surfaces.vertices, axis=0)

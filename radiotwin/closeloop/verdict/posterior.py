@@ -30,7 +30,7 @@ NONE, OTHER = "none", "not in the catalogue"
 
 @dataclass(frozen=True)
 class Step:
-    """What the residual says at one step of the search.
+    """Evidence and probabilities of causes at one step of the search.
 
     Attributes:
         number: number of effects found before.

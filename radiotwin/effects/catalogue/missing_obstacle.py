@@ -275,7 +275,7 @@ class MissingObstacle(GainEffect):
 
     @override
     def contradicted(self, links: Links) -> str | None:
-        """Return why no building can be there, or nothing tells how far away it is; else None."""
+        """Return why a building there is impossible or its distance unknown; else None."""
         through = devices_through(self.params.box, links)
         if is_beside_unknown(through, links):
             return BESIDE_UNKNOWN
@@ -326,7 +326,7 @@ class MissingObstacle(GainEffect):
 
 
 def _shadow_options(links: Links, options: tuple[T, ...]) -> tuple[T, ...]:
-    """Return the trial powers in a shadow; the first one only if no map tells the power there."""
+    """Return the trial powers in a shadow; without a map, which would predict it, the first one."""
     return options if links.city is not None else options[:1]
 
 

@@ -141,7 +141,7 @@ def _derivatives(fit: Fit, number: int, variation: Variation | None,
                  design_effect: float) -> list[ReadingDerivative]:
     """Compute the derivative of the readings in each parameter of an effect, by apt steps.
 
-    A step is about as wide as the parameter's uncertainty, which a first step tells.
+    A step is about as wide as the parameter's uncertainty, which a first step estimates.
     """
     if variation is None:
         return []
