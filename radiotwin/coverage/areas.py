@@ -54,15 +54,10 @@ class CoverageGrid:
     @classmethod
     def over(cls, bounds_m: tuple[float, float, float, float], step_m: float,
              height_m: float) -> "CoverageGrid":
-        """Fill an area with whole cells, starting in its south-west corner.
+        """Fill an area (x_min, x_max, y_min, y_max) [m] with cells from its south-west corner.
 
-        Args:
-            bounds_m: (x_min, x_max, y_min, y_max) [m].
-            step_m: side of a cell [m].
-            height_m: of the receivers above the ground [m].
-
-        Raises:
-            BadInput: no cell fits, or there are too many.
+        Receivers are at `height_m` above the ground [m]. BadInput if no cell fits, or there are too
+        many.
         """
         x_min, x_max, y_min, y_max = bounds_m
         nx, ny = (np.floor((high - low) / step_m + 1e-9)
@@ -79,8 +74,7 @@ class CoverageGrid:
     def of_map(cls, lattice: Lattice, level: int) -> "CoverageGrid":
         """Return cells centred on the positions of a radio map, at the altitude of index `level`.
 
-        Raises:
-            BadInput: the positions are not evenly spaced, or too many.
+        BadInput if the positions are not evenly spaced, or too many.
         """
         step_m = lattice.step_m
         if not step_m or any(not np.allclose(np.diff(axis), step_m, rtol=0, atol=1e-6 * step_m)
@@ -115,12 +109,9 @@ class CoverageGrid:
         return self.at_height(x, y, city)
 
     def at_height(self, x_m: np.ndarray, y_m: np.ndarray, city: CityMap) -> np.ndarray:
-        """Return positions (n, 3) [m] at the receivers' height.
+        """Return positions (n, 3) [m] at the receivers' height above the ground of a map.
 
-        Args:
-            x_m: (n,) to the east [m].
-            y_m: (n,) to the north [m].
-            city: 3D map with the ground below the receivers, see `with_ground_as_terrain`.
+        See `with_ground_as_terrain`.
         """
         bottom_m = city.ground_height_m(x_m, y_m) if self.above_ground else 0.0
         return np.column_stack([x_m, y_m, np.broadcast_to(bottom_m + self.height_m, x_m.shape)])
@@ -184,12 +175,7 @@ def read_areas(path: Path | str, scene: Scene) -> list[Area]:
 
 
 def class_bounds(settings: CoverageSettings, bandwidth_hz: float) -> dict[str, tuple[float, ...]]:
-    """Return the lower ends of the classes of each raster, descending.
-
-    Args:
-        settings: with the classes of received power and the rate's model.
-        bandwidth_hz: of the channel [Hz].
-    """
+    """Return the lower ends of the classes of each raster, descending."""
     top_bps = bandwidth_hz * settings.rate.max_bps_hz
     return {"received_power_dbm": settings.classes_dbm, "snr_db": SINR_CLASSES_DB,
             "sinr_db": SINR_CLASSES_DB, "rate_bps": tuple(top_bps * each for each in RATE_CLASSES),
@@ -199,24 +185,11 @@ def class_bounds(settings: CoverageSettings, bandwidth_hz: float) -> dict[str, t
 def area_records(dataset: xr.Dataset, grid: CoverageGrid, transmitters: Sequence[Transmitter],
                  settings: CoverageSettings, classes: dict[str, tuple[float, ...]],
                  areas: Sequence[Area]) -> list[dict[str, Any]]:
-    """Compute covered shares of the whole extent and of each polygon.
+    """Compute covered shares: a record of the whole extent, then one of each polygon.
 
     A cell belongs to an area if its middle does. Cells inside buildings do not count, unless there
-    is an indoor loss. A cell where nothing is detected is below every threshold.
-
-    Args:
-        dataset: see `Coverage.dataset`.
-        grid: its cells.
-        transmitters: the servers, by index.
-        settings: threshold, reliability and indoor loss.
-        classes: descending thresholds by raster, see `class_bounds`.
-        areas: polygons.
-
-    Returns:
-        A record for the extent, then one for each polygon.
-
-    Raises:
-        BadInput: no cell of a polygon is predicted.
+    is an indoor loss. A cell where nothing is detected is below every threshold. `dataset` is as of
+    `Coverage`, `classes` of `class_bounds`. BadInput if no cell of a polygon is predicted.
     """
     indoor = dataset["indoor"].values
     counted = np.ones_like(indoor) if settings.indoor_loss_db is not None else ~indoor
@@ -276,9 +249,8 @@ def _covered_shares(power_dbm: np.ndarray, sd_db: np.ndarray | None, threshold_d
                     reliability: float) -> dict[str, float]:
     """Compute which share of cells reaches a threshold [dBm].
 
-    `share` counts cells whose median power does, `share_reliable` cells whose location probability
-    is at least the reliability; `mean_probability` is the mean location probability. The last two
-    use the cells whose standard deviation is known.
+    `share` counts cells whose median power does, `share_reliable` those whose location probability
+    is at least the reliability; `mean_probability` is the mean of that, where it is known.
     """
     found = {"threshold": threshold_dbm, "share": float((power_dbm >= threshold_dbm).mean())}
     if sd_db is None:

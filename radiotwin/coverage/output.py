@@ -73,8 +73,7 @@ class Legend:
     def classes(self, values: np.ndarray) -> np.ndarray:
         """Return the class index of each value (0: the highest class), any shape; -1 for NaN.
 
-        A legend without lower bounds, that of the best server, has one class per transmitter: its
-        values are the indices of transmitters already and are returned as integers.
+        Values of best servers are such indices already.
         """
         if not self.lower:
             return values.astype(np.int32)
@@ -109,11 +108,7 @@ def drawn_rasters(coverage: Coverage) -> Sequence[str]:
 
 
 def file_stem(name: str) -> str:
-    """Return the name of a raster's files without suffix.
-
-    >>> file_stem("received_power_dbm")
-    'received_power'
-    """
+    """Return the name of a raster's files without suffix, such as `received_power`."""
     for ending in ("_dbm", "_db", "_bps"):
         name = name.removesuffix(ending)
     return name
@@ -136,10 +131,7 @@ def _require_features() -> Any:
 
 
 def _write_geopackage(coverage: Coverage, scene: Scene, path: Path) -> None:
-    """Write a layer for each raster, with a multipolygon for each class, and a transmitters layer.
-
-    Coordinates are WGS84 degrees, or local metres if the scene has no origin.
-    """
+    """Write a layer for each raster, of a multipolygon for each class, and one of transmitters."""
     features = _require_features()
     grid, origin = coverage.grid, scene.config.origin
     transform = georeference(grid.x_m, grid.y_m, grid.step_m, origin)["transform"]
@@ -282,12 +274,7 @@ def _legend_png(legends: list[Legend]) -> bytes:
 def available_formats(scene: Scene, wanted: list[str] | None) -> tuple[list[str], list[str]]:
     """Return the formats that can be written for a scene, and the reasons why others cannot.
 
-    Args:
-        scene: of the coverage.
-        wanted: formats required by the user; None: all that can be written.
-
-    Raises:
-        BadInput: an unknown format, or a required one that cannot be written.
+    BadInput if one of those `wanted` is unknown or cannot; None: all that can are.
     """
     for name in wanted or ():
         if name not in FORMATS:
@@ -305,14 +292,7 @@ def available_formats(scene: Scene, wanted: list[str] | None) -> tuple[list[str]
 
 
 def write_formats(coverage: Coverage, scene: Scene, folder: Path, formats: list[str]) -> None:
-    """Write rasters and vectors to a folder.
-
-    Args:
-        coverage: of the network.
-        scene: of the coverage.
-        folder: to write to.
-        formats: names among `FORMATS`; `radiotwin.report` writes `png`.
-    """
+    """Write rasters and vectors in some `FORMATS` to a folder; `radiotwin.report` writes `png`."""
     if "nc" in formats:
         _write_netcdf(coverage, scene, folder / "coverage.nc")
     if "tif" in formats:
@@ -375,9 +355,8 @@ class Layer:
 def geopackage(layers: Iterable[Layer], in_degrees: bool) -> bytes:
     """Return the bytes of a GeoPackage; equal layers give equal bytes.
 
-    Args:
-        layers: names of layers and columns must be SQL identifiers.
-        in_degrees: whether coordinates are WGS84 degrees, else metres of a local frame.
+    Names of layers and columns must be SQL identifiers. Coordinates are WGS84 degrees if
+    `in_degrees`, else metres of a local frame.
     """
     system = _DEGREES if in_degrees else _CARTESIAN
     with closing(sqlite3.connect(":memory:")) as database:

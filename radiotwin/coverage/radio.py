@@ -110,13 +110,7 @@ def thermal_noise_dbm(bandwidth_hz: float) -> float:
 
 
 def rate_bps(sinr_db: np.ndarray, bandwidth_hz: float, model: RateModel) -> np.ndarray:
-    """Return the rate of links [bit/s], see `RateModel`; 0 where the SINR is NaN.
-
-    Args:
-        sinr_db: any shape [dB].
-        bandwidth_hz: of the channel [Hz].
-        model: rate by SINR.
-    """
+    """Return the rate of links of any shape [bit/s], see `RateModel`; 0 where the SINR is NaN."""
     with np.errstate(invalid="ignore"):
         bound = model.share * np.log2(1 + 10 ** (sinr_db / 10))
         usable = sinr_db >= model.min_sinr_db
@@ -125,15 +119,10 @@ def rate_bps(sinr_db: np.ndarray, bandwidth_hz: float, model: RateModel) -> np.n
 
 def location_probability(power_dbm: np.ndarray, sd_db: np.ndarray,
                          threshold_dbm: float) -> np.ndarray:
-    """Return the probability that log-normal received power reaches a threshold.
+    """Return the probability that log-normal received power reaches a threshold [dBm].
 
-    Args:
-        power_dbm: median power, any shape [dBm]; NaN: not detected.
-        sd_db: standard deviation, same shape [dB]; NaN: unknown.
-        threshold_dbm: [dBm]
-
-    Returns:
-        Same shape; 0 if nothing is detected, NaN if the standard deviation is unknown.
+    The median power [dBm] and its standard deviation [dB] have any one shape. The result is 0 if
+    nothing is detected (NaN), and NaN if the standard deviation is unknown.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         certain = np.where(power_dbm >= threshold_dbm, 1.0, 0.0)
@@ -148,15 +137,8 @@ def channel_overlap(frequencies_hz: np.ndarray, bandwidth_hz: float,
 
     The transmitter's power density is flat within its channel, and lower by the leakage ratio in
     the two adjacent channels on each side. The receiver's filter passes its whole channel and
-    nothing else.
-
-    Args:
-        frequencies_hz: (f,) centre frequencies [Hz].
-        bandwidth_hz: of every channel [Hz].
-        aclr_db: adjacent-channel leakage ratio [dB], of both adjacent channels.
-
-    Returns:
-        (f, f) shares; rows are receivers' channels, columns transmitters'.
+    nothing else. Of centre frequencies (f,) [Hz], rows of the result (f, f) are receivers, columns
+    transmitters.
     """
     apart = np.abs(frequencies_hz[:, None] - frequencies_hz) / bandwidth_hz
     inside = np.clip(1 - apart, 0, 1)
@@ -188,12 +170,7 @@ class ServerTally:
             channel: int) -> None:
         """Add a transmitter: make it the best server where it is strongest, else interference.
 
-        Args:
-            row: index of the transmitter.
-            power_dbm: (n,) power received from it [dBm]; NaN if not detected.
-            sd_db: (n,) standard deviation of that power [dB].
-            load: share of the time that the transmitter is active.
-            channel: index of its channel.
+        Its power (n,) [dBm], NaN if not detected, has a standard deviation [dB].
         """
         heard = np.isfinite(power_dbm)
         best = heard & ((self.server < 0) | (power_dbm > self.power_dbm))

@@ -139,10 +139,7 @@ def predict_coverage(source: Twin | RadioMap | str, scene: Scene | Path | str,
 def _transmitters(source: Twin | RadioMap | str, scene: Scene,
                   given: Sequence[Transmitter] | None, devices: list[str] | None,
                   settings: CoverageSettings) -> list[Transmitter]:
-    """Return the transmitters to predict, each with position, power, load and frequency.
-
-    Arguments and errors are those of `predict_coverage`; `given` is its `transmitters`.
-    """
+    """Return the transmitters to predict, each with position, power, load and frequency."""
     found = scene_transmitters(scene) if given is None else list(given)
     if isinstance(source, Twin):
         found = filled_in_from_twin(source, twin_transmitters(source, found) if given is None
@@ -184,13 +181,9 @@ def _transmitters(source: Twin | RadioMap | str, scene: Scene,
 
 
 def _moved_outdoors(transmitters: list[Transmitter], scene: Scene) -> list[Transmitter]:
-    """Move transmitters that are barely inside a building, within the map's accuracy, outside.
+    """Move transmitters that are barely inside a building outside, with a warning.
 
-    Warns:
-        A transmitter is moved.
-
-    Raises:
-        BadInput: a transmitter is deeper inside a building, or below the ground.
+    BadInput if one is deeper inside than a map is off, or below the ground.
     """
     found = []
     for each in transmitters:
@@ -268,9 +261,8 @@ def _rasters(gains: GainSource, scene: Scene, transmitters: list[Transmitter], g
              bandwidth_hz: float) -> dict[str, np.ndarray]:
     """Predict power, best server, SNR, SINR, rate and probability; return rasters (ny, nx) by name.
 
-    Cells inside buildings are predicted only with an indoor loss. Where nothing is received, best
-    server is -1 and levels are NaN. A model without standard deviations has no rasters of standard
-    deviation and coverage probability.
+    Where nothing is received, best server is -1 and levels are NaN. A model without standard
+    deviations has no rasters of standard deviation and coverage probability.
     """
     frequencies_hz = sorted({each.frequency_hz or 0.0 for each in transmitters})
     overlap = channel_overlap(np.array(frequencies_hz), bandwidth_hz, settings.aclr_db)

@@ -54,13 +54,7 @@ class GainSource:
 def source_over(model: str, scene: Scene, transmitters: Sequence[Transmitter]) -> GainSource:
     """Return the gain source of a model that needs no measurements; receivers are isotropic.
 
-    Args:
-        model: name of a published law, or `paths`, which follows paths over the map.
-        scene: 3D map.
-        transmitters: each with a frequency.
-
-    Raises:
-        BadInput: no such model, or one that is learnt from measurements.
+    It is a published law, or `paths`, which follows paths over the map; BadInput for another.
     """
     kind, city = channel_named(model), with_ground_as_terrain(scene.city)
     if kind is ImagePaths:
@@ -147,18 +141,11 @@ def _source_of_paths(city: CityMap, transmitters: Sequence[Transmitter]) -> Gain
 def source_of_twin(twin: Twin, scene: Scene, transmitters: Sequence[Transmitter]) -> GainSource:
     """Return the gain source of a twin, for its devices and for new transmitters.
 
-    A new transmitter gets the twin's general law, plus its antenna's gain along the straight line.
-    Powers and antennas that were declared for a device were subtracted before the twin was fitted,
-    so others may be declared now. An undeclared antenna is part of the learnt levels, and stays.
-
-    Args:
-        twin: learnt in the scene.
-        scene: its 3D map.
-        transmitters: one with the name of a device of the twin, within a metre of it, is that
-            device; others are new.
-
-    Raises:
-        BadInput: the twin is of another map, or predicts received powers and lacks a transmitter.
+    A transmitter with the name of a device, within a metre of it, is that device. A new one gets
+    the twin's general law, plus its antenna's gain along the straight line. Powers and antennas
+    that were declared for a device were subtracted before the twin was fitted, so others may be
+    declared now. An undeclared antenna is part of the learnt levels, and stays. BadInput if the
+    twin is of another map, or predicts received powers and lacks a transmitter.
     """
     twin.require_map(scene)
     twin.warn_of_another_scene(scene, scene.content_hash())
@@ -227,11 +214,7 @@ def _notes_of_twin(twin: Twin, transmitters: Sequence[Transmitter], rows: list[i
                    has_power: bool) -> list[str]:
     """Return sentences on transmitters without measurements, and on antennas and powers not used.
 
-    Args:
-        twin: the model.
-        transmitters: of the network.
-        rows: row of each transmitter in `twin.devices`; len(twin.devices) for a new transmitter.
-        has_power: whether the twin predicts received powers of undeclared transmit powers.
+    `rows` are those of the transmitters in `twin.devices`, or their number for a new one.
     """
     device_count, notes = len(twin.devices), []
     new = [each for each, row in zip(transmitters, rows) if row == device_count]
@@ -262,13 +245,7 @@ def _notes_of_twin(twin: Twin, transmitters: Sequence[Transmitter], rows: list[i
 
 def source_of_map(radio_map: RadioMap, level: int,
                   transmitters: Sequence[Transmitter]) -> GainSource:
-    """Return the gain source of a radio map at one altitude; its gains include its antennas.
-
-    Args:
-        radio_map: of the scene.
-        level: index of the altitude.
-        transmitters: devices of the map.
-    """
+    """Return the gain source of a radio map at one altitude; its gains include its antennas."""
     row_of = {name: row for row, name in enumerate(radio_map.devices)}
     dataset = radio_map.dataset
 
@@ -305,11 +282,7 @@ def filled_in_from_twin(twin: Twin, transmitters: Sequence[Transmitter]) -> list
 
 
 def altitude_row(radio_map: RadioMap, height_m: float | None) -> int:
-    """Return the index of the altitude `height_m` [m] in a radio map; None: 0, the lowest.
-
-    Raises:
-        BadInput: the map has no such altitude.
-    """
+    """Return the index of the altitude `height_m` [m] in a radio map; None: 0, the lowest."""
     altitudes_m = radio_map.lattice.z_m
     if height_m is None:
         return 0

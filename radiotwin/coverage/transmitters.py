@@ -125,15 +125,9 @@ def select(transmitters: list[Transmitter], names: list[str] | None) -> list[Tra
 
 def with_powers(transmitters: list[Transmitter], scene: Scene,
                 tx_power_dbm: float | None) -> list[Transmitter]:
-    """Return transmitters with a transmit power, a default one where they declare none.
+    """Return transmitters with a transmit power where they declare none: the given, or the scene's.
 
-    Args:
-        transmitters: with or without a power.
-        scene: its declared power is the default if `tx_power_dbm` is None.
-        tx_power_dbm: default transmit power [dBm].
-
-    Raises:
-        BadInput: a transmit power that neither transmitter, scene nor `tx_power_dbm` declares.
+    BadInput if neither declares one.
     """
     radio = scene.config.radio
     unknown = [each.name for each in transmitters if each.tx_power_dbm is None]
@@ -153,10 +147,7 @@ def with_powers(transmitters: list[Transmitter], scene: Scene,
 
 
 def _positions(path: Path, sites: SiteTable, scene: Scene) -> tuple[np.ndarray, list[str]]:
-    """Return positions (k, 3) in the scene's frame [m], and notes on implausible ones.
-
-    Implausible: over 100 km from the map's middle, or all more than 200 m above the ground.
-    """
+    """Return positions (k, 3) in the scene's frame [m], and notes on implausible ones."""
     names, values = sites.names, sites.values
 
     def named(row: int) -> str:

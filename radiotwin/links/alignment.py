@@ -82,12 +82,8 @@ def as_measurements(given: Measurements | pd.DataFrame | Path | str,
                     scene: Scene | None) -> Measurements:
     """Return measurements in the frame of a scene, from an object, a file or a data frame.
 
-    Positions read from a file or a data frame are also checked against the map, see
-    `in_scene_frame`. A `Measurements` object is not checked: it is converted if both origins are
-    known, else returned as it is. Without a scene positions stay as they are.
-
-    Raises:
-        BadInput: `given` is none of these, cannot be read, or does not fit the scene.
+    Positions of a file or a data frame are checked against the map (`in_scene_frame`), those of a
+    `Measurements` object are only converted. BadInput if `given` is none of these.
     """
     if isinstance(given, Measurements):
         return in_known_frame(given, None if scene is None else scene.config.origin, "the scene")
@@ -104,13 +100,7 @@ def as_measurements(given: Measurements | pd.DataFrame | Path | str,
 def in_known_frame(measurements: Measurements, origin: Origin | None, owner: str) -> Measurements:
     """Convert measurements to the frame about an origin, if that and their own origin are known.
 
-    Args:
-        measurements: returned unchanged if an origin is unknown or both are the same.
-        origin: of the target frame.
-        owner: what that frame belongs to, for the warning.
-
-    Warns:
-        Positions were converted, with how far they moved.
+    A warning says how far they moved, and that the frame belongs to `owner`.
     """
     old = measurements.origin
     if old is None or origin is None or is_same_frame(old, origin):
@@ -199,14 +189,9 @@ class ShiftSearch:
 def search_shift(scene: Scene, receiver_m: np.ndarray) -> ShiftSearch | None:
     """Search the translation that moves receivers (n, 3) [m] out of buildings and onto the map.
 
-    Receivers follow streets: in the right frame far fewer are inside buildings than the building
-    density around them predicts. A translation is scored by its contrast: receivers inside
-    buildings minus the number that this density predicts, in standard deviations; the lowest wins.
-    The search covers a grid of translations, at the receivers' median height above the ground.
-    28,682 readings of a real drive test, moved by 94 to 316 m, were moved back within 2 m.
-
-    Returns:
-        the search result; None if no translation in range moves the receivers onto the map.
+    The lowest contrast wins, see `ShiftSearch`, on a grid of translations at the receivers' median
+    height above the ground; None if none moves them onto the map. 28,682 readings of a real drive
+    test, moved by 94 to 316 m, were moved back within 2 m.
     """
     (low_m, high_m), reach_m = map_corners_m(scene), SEARCHED_M + 2 * COARSE_M
     low_m = np.maximum(low_m, receiver_m[:, :2].min(axis=0) - reach_m)

@@ -139,14 +139,8 @@ def check_positions(receiver_m: np.ndarray, device_m: np.ndarray,
                     scene: Scene | None) -> list[str]:
     """Note positions that are probably in another unit or frame, as all lie within `CLOSE_M`.
 
-    Args:
-        receiver_m: (n, 3) [m].
-        device_m: (k, 3) [m].
-        scene: with the 3D map; None: there is no map to compare positions with.
-
-    Raises:
-        BadInput: all receivers and devices are within `CLOSE_M`, or most receivers are outside the
-            map.
+    Receivers are (n, 3), devices (k, 3) [m]; without a scene they are compared with no map.
+    BadInput if all of both lie within `CLOSE_M`, or most receivers are outside the map.
     """
     both = "receivers and devices"
     notes = {}
@@ -240,11 +234,8 @@ def receiver_notes(receiver_m: np.ndarray, scene: Scene) -> list[str]:
 def move_anchors_out(links: Links, scene: Scene, refuse: bool = True) -> Links:
     """Move anchors (devices of declared position) out of buildings and above the map's ground.
 
-    An anchor is moved only by as much as a map may be wrong, see `radiotwin.scene.footing`; a note
-    says which ones were moved. Without `refuse`, one that is too deep inside stays there.
-
-    Raises:
-        BadInput: an anchor is far from the receivers, or too deep inside a building.
+    An anchor is moved only by as much as a map may be wrong (`radiotwin.scene.footing`), with a
+    note. BadInput if one is far from the receivers or, with `refuse`, too deep inside a building.
     """
     anchors = np.array(sorted(links.anchors), dtype=int)
     anchors = anchors[np.isfinite(links.device_m[anchors]).all(axis=1)]
@@ -281,14 +272,8 @@ def uninformative_receivers(table: pd.DataFrame, level_db: np.ndarray,
                       keep: np.ndarray) -> list[tuple[np.ndarray, str]]:
     """Find receivers that detect nothing, read one level only, or have few links that are used.
 
-    Args:
-        table: n measurements.
-        level_db: (n,) [dB]; NaN = not detected.
-        keep: (n,) bool, links that are used so far.
-
-    Returns:
-        for each of the three faults, a mask (n,) of the links of such receivers, which may be all
-        false, and the reason to leave them out.
+    `level_db` and `keep` (n,) are of the rows of `table`, `keep` of those used so far. The result
+    has for each of the three faults a mask (n,) of such links, and the reason to leave them out.
     """
     end, names = pd.factorize(table["receiver"], sort=True)
     links = np.bincount(end[keep], minlength=len(names))
@@ -313,10 +298,8 @@ def unheard_devices(table: pd.DataFrame, level_db: np.ndarray,
                     keep: np.ndarray) -> tuple[np.ndarray, str]:
     """Find devices that were never detected on `MIN_LINKS` or more links, as if switched off.
 
-    A device with fewer links may be one position of a moving device, where it is information that
-    it was not detected. For levels (n,) [dB], NaN = not detected, of the rows `keep` (n,) of
-    `table`, the result is a mask (n,) of the links of such devices, and the reason to leave them
-    out.
+    One with fewer links may be a position of a moving device, where silence is information.
+    Arguments and result are as of `uninformative_receivers`.
     """
     end, names = pd.factorize(table["device"], sort=True)
     links, heard = (np.bincount(end[rows], minlength=len(names))
@@ -328,13 +311,10 @@ def unheard_devices(table: pd.DataFrame, level_db: np.ndarray,
 
 
 def find_fill_value(level_db: np.ndarray) -> tuple[float | None, float]:
-    """Find the level that a receiver writes in place of "not detected", if there is one.
+    """Find the level that a receiver writes in place of "not detected"; return it and its share.
 
-    It is the lowest level (n,) [dB], NaN = not detected, if it is far more frequent than the next
-    ones, or occurs three times and lies far below them (by 3 dB, and by ten usual steps).
-
-    Returns:
-        that level [dB], None if there is none, and its share of all readings.
+    It is the lowest of `level_db` (n,), if it is far more frequent than the next ones, or occurs
+    three times and lies far below them (by 3 dB, and by ten usual steps). None without one.
     """
     seen = level_db[np.isfinite(level_db)]
     if len(seen) < MIN_LINKS:

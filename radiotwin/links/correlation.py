@@ -44,12 +44,11 @@ REMEMBERED = 8  # cached variograms: a model and its folds
 
 
 def pairs_of_links(place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Choose pairs of links to compare: each with its nearest neighbours and with later links.
+    """Choose pairs of links to compare: return first and second row of each pair, (p,) each.
 
-    Neighbours are the `NEIGHBOURS` nearest in `place` (n, d) [m], positions of both ends and a last
-    coordinate that tells series apart; later links are `LAGS` rows on. Only links of one series are
-    paired. Of more than `MAX_LINKS` links a sample, with a fixed seed so that results repeat, is
-    used. Returned are first and second row of each pair, (p,) each.
+    Each of at most `MAX_LINKS` sampled links is paired with its `NEIGHBOURS` nearest in `place` (n,
+    d) [m], positions of both ends and a last coordinate that tells series apart, and with the links
+    `LAGS` rows on, in its series.
     """
     n = len(place)
     every = np.arange(n) if n <= MAX_LINKS else np.sort(
@@ -107,15 +106,8 @@ class Trend:
                 lengths_m: np.ndarray) -> np.ndarray:
         """Compute semivariances of unit-variance fields without this trend, for pairs of links.
 
-        Args:
-            position_m: (n, d) positions of all links [m].
-            i: (p,) first link of each pair, an index into `rows`.
-            j: (p,) second link, likewise.
-            lengths_m: (k,) correlation lengths [m].
-
-        Returns:
-            (1 + k, p): that of white noise, then that of a field whose correlation falls
-            exponentially over each length.
+        Pairs are `i` and `j` (p,), indices into `rows`; `position_m` (n, d) is of all links. The
+        result (1 + k, p) is that of white noise, then of a field for each of `lengths_m` (k,).
         """
         used, place = np.unique(np.concatenate([i, j]), return_inverse=True)
         a, b = place.reshape(2, -1)
@@ -163,8 +155,8 @@ class Variogram:
            lengths_m: np.ndarray) -> Variogram:
         """Compute the model semivariance of pairs of links over distance, for correlation lengths.
 
-        Pairs are rows `first` and `second` (p,) of links with both ends at `position_m` (n, d).
-        Distance bins begin at the first of `lengths_m`, the shortest correlation length.
+        Pairs are rows `first` and `second` (p,) of `position_m` (n, d). Distance bins begin at the
+        first of `lengths_m` (k,), which ascend.
         """
         distance_m, least_m = _distance_m(position_m, first, second), float(lengths_m[0])
         edges = np.geomspace(least_m, max(float(distance_m.max(initial=0)), 2 * least_m), BINS)
@@ -176,10 +168,8 @@ class Variogram:
     def length_m(self, z: np.ndarray) -> float:
         """Fit the correlation length [m] of residuals (n,), divided by their scale.
 
-        The measured semivariance over distance (robust: Cressie and Hawkins) is compared with
-        `model_semivariances`, that of a model for each of `lengths_m`. The result is the
-        shortest of these if the residuals are uncorrelated, or too few distance bins have enough
-        pairs.
+        It is the shortest of `lengths_m` if they are uncorrelated, or too few bins have enough
+        pairs. The measured semivariance is the robust one of Cressie and Hawkins.
         """
         detrended = np.empty(len(z))
         for trend in self.trends:
@@ -198,11 +188,9 @@ class Variogram:
 def _model_semivariances(position_m: np.ndarray, trends: list[Trend], first: np.ndarray,
                          second: np.ndarray, index: np.ndarray, lengths_m: np.ndarray,
                          ) -> np.ndarray:
-    """Average the model semivariances of pairs of links in bins of distance.
+    """Average the model semivariances (1 + k, bins) of pairs of links in bins (p,) of distance.
 
-    Pairs are rows `first` and `second` (p,) of links with both ends at `position_m` (n, d), both in
-    one of the trends; `index` (p,) is their bin. The result (1 + k, bins) is that of white noise,
-    then of a field of each length (k,) [m]; NaN in a bin without a pair.
+    First that of white noise, then of a field of each length (k,); NaN in a bin without a pair.
     """
     trend_of = np.empty(len(position_m), dtype=int)
     for number, trend in enumerate(trends):
@@ -227,9 +215,7 @@ def _best_length_m(gamma: np.ndarray, pairs: np.ndarray, model_semivariances: np
                    lengths_m: np.ndarray) -> float:
     """Return the correlation length [m] whose model semivariances fit the measured ones best.
 
-    A nugget (uncorrelated part) and a sill (correlated part) of each length (k,) are fitted by
-    least squares to `gamma` (b,), measured in bins of `pairs` (b,) pairs; `model_semivariances`
-    (1 + k, b) are those of white noise, and of each length. It is the first length if no sill
+    A nugget and a sill of each length are fitted to `gamma` (b,). It is the first length if no sill
     reaches a share `MIN_CORRELATED`.
     """
     # Bins are dependent: beyond some hundreds of pairs, more make a bin no more certain.
@@ -295,11 +281,10 @@ def median_step_m(links: Links) -> float:
 
 
 def correlation_length_m(links: Links, z: np.ndarray) -> float:
-    """Return the distance [m] over which the correlation of a residual falls to 1/e.
+    """Return the distance [m] over which the correlation of residuals (n,) falls to 1/e.
 
-    `z` (n,) are residuals divided by their scale; links not detected, or with NaN, are ignored. The
-    result is at least the median step between positions (that of an uncorrelated residual), and at
-    most a quarter of the extent of the campaign.
+    Links not detected, or with NaN, are ignored. The result is between the median step of positions
+    (that of an uncorrelated residual) and a quarter of the extent of the campaign.
     """
     seen = np.isfinite(links.level_db) & np.isfinite(z)
     least_m, rows, variogram = _variogram(links, seen.tobytes())
@@ -308,11 +293,9 @@ def correlation_length_m(links: Links, z: np.ndarray) -> float:
 
 @lru_cache(maxsize=REMEMBERED)
 def _variogram(links: Links, seen: bytes) -> tuple[float, np.ndarray, Variogram | None]:
-    """Prepare what is needed to fit a correlation length to residuals of detected links.
+    """Prepare a variogram: shortest length [m], detected links (m,) in its order, and it or None.
 
-    `seen` is the mask of detected links as bytes: the key of a cache, as this takes long. Returned
-    are the shortest length [m], the indices (m,) of detected links in the variogram's order, and
-    the variogram; None if links are too few or the campaign is too small.
+    `seen` is the mask of detected links as bytes: the key of a cache, as this takes long.
     """
     least_m, most_m = median_step_m(links), EXTENT_SHARE * extent_m(moving_end_m(links))
     rows = np.flatnonzero(np.frombuffer(seen, dtype=bool))
@@ -334,12 +317,9 @@ def _variogram(links: Links, seen: bytes) -> tuple[float, np.ndarray, Variogram 
 
 
 def _separated_places(links: Links, label: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return positions of both ends of links, with one more coordinate that sets labels apart.
+    """Return ends of links, with a coordinate that sets labels apart (n, 7), and by how much [m].
 
     Nearest neighbours in these coordinates always have the same label (n,).
-
-    Returns:
-        (n, 7) [m], and the distance [m] between two labels in the last coordinate.
     """
     ends_m = np.column_stack([links.receiver_m, np.nan_to_num(links.device_m[links.device])])
     offset_m = 4.0 * float(np.ptp(ends_m, axis=0).max(initial=0.0)) + 1.0

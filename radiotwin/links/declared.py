@@ -52,9 +52,7 @@ def tx_power_dbm(device: str, power_dbm: float | None, eirp_dbm: float | None,
     """Return the transmit power [dBm] from a declared power or EIRP; None if both are unknown.
 
     EIRP is the power minus the cable loss plus the antenna's peak gain (ITU-R V.573-6, A43).
-
-    Raises:
-        BadInput: both are declared, and contradict each other.
+    BadInput if both are declared and contradict each other.
     """
     if eirp_dbm is None:
         return power_dbm
@@ -142,15 +140,9 @@ class Declared:
         return not self.fed_db.any() and not self.has_antennas
 
     def added_db(self, device: np.ndarray, ray_m: np.ndarray) -> np.ndarray | float:
-        """Return declared power, cable loss and antenna gains of links: level minus isotropic gain.
+        """Return declared power, cable loss and antenna gains (n,) [dB] of links, or the number 0.
 
-        Args:
-            device: (n,) index of each link's device.
-            ray_m: (n, 3) straight line from the device to the receiver [m]; NaN if the device may
-                be anywhere.
-
-        Returns:
-            (n,) [dB]; the number 0 if nothing is declared.
+        `ray_m` (n, 3) goes straight from the device to the receiver; NaN if that may be anywhere.
         """
         if self.adds_nothing:
             return 0.0
@@ -196,18 +188,10 @@ NOTHING = Declared((), np.nan, False)
 
 def radios_of(devices: pd.DataFrame, patterns: dict[str, Pattern], scene: Scene | None
               ) -> tuple[Radio, ...]:
-    """Read each device's radio from a table of devices; antennas also from the scene.
+    """Read the radio of each of k devices from their table; empty if nothing is declared.
 
-    Args:
-        devices: k rows, see `Measurements.devices`.
-        patterns: file name in the column `antenna` -> pattern.
-        scene: gives the antenna of a device if the table names none; None: no scene.
-
-    Returns:
-        k radios; empty if nothing is declared.
-
-    Raises:
-        BadInput: a power contradicts an EIRP, or a pattern is missing.
+    A device whose row names no antenna has that of the scene. `patterns` are those of the files in
+    the column `antenna`. BadInput if a power contradicts an EIRP, or a pattern is missing.
     """
     of_scene: dict[str, Antenna | None] = {}
     if scene is not None:
@@ -241,14 +225,8 @@ def complete(names: Sequence[str], radios: tuple[Radio, ...], has_power: bool,
              scene: Scene | None) -> tuple[tuple[Radio, ...], list[str]]:
     """Fill in missing transmit powers if any device declares one, and note every assumption.
 
-    Args:
-        names: of k devices.
-        radios: k radios; empty: nothing is declared.
-        has_power: whether levels are received powers.
-        scene: its declared power is assumed first, else the median of the other devices.
-
-    Returns:
-        the completed radios, and notes.
+    The scene's declared power is assumed first, else the median of the other devices. Without
+    `has_power`, levels are gains.
     """
     notes: list[str] = []
     known_dbm = [radio.tx_power_dbm for radio in radios if radio.tx_power_dbm is not None]
@@ -278,19 +256,11 @@ def antenna_of_uavs(scene: Scene | None, receivers: Sequence[str]
 
 def match_learnt_law(names: Sequence[str], declared: Declared, learnt: Declared, scene: Scene | None
               ) -> tuple[Declared, list[str]]:
-    """Adapt the radios of new devices to a law of channel gain that was learnt from others.
+    """Adapt the radios of k new devices to a law of channel gain that was learnt from others.
 
-    If the law was learnt with declared transmit powers, missing ones are assumed; if it was learnt
-    without, the powers are part of the law, and declared ones are dropped.
-
-    Args:
-        names: of k new devices.
-        declared: radios of the new devices.
-        learnt: radios of the devices that the law was learnt from.
-        scene: its declared power is assumed first, else the median of the learnt devices.
-
-    Returns:
-        the adapted radios, and notes.
+    If the law was learnt with declared transmit powers, missing ones are assumed: the scene's, else
+    the median of the learnt devices. If it was learnt without, the powers are part of the law, and
+    declared ones are dropped. Notes say so.
     """
     notes: list[str] = []
     radios = declared.radios or tuple(Radio() for _ in names)

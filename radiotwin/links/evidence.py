@@ -57,9 +57,8 @@ def _evidence(links: Links) -> np.ndarray:
 def with_evidence(links: Links, z: np.ndarray) -> Links:
     """Group links whose errors are alike into pieces of evidence, which scores count as one.
 
-    A piece holds the links of a device, receiver and flight on a square of ground as wide as the
-    distance over which the residuals `z` (n,) of the base model (without effects), divided by their
-    scale, are correlated. A note is added if there are fewer than `FEW_SQUARES` squares.
+    A piece is as wide as the distance over which residuals `z` (n,) of the base model are
+    correlated. A note is added if there are fewer than `FEW_SQUARES` squares.
     """
     length_m = correlation_length_m(links, z)
     width_m = evidence_width_m(links, length_m)
@@ -90,10 +89,10 @@ def _squares_occupied(position_m: np.ndarray, width_m: float) -> int:
 
 
 def _group_indices(links: Links, width_m: float, place_m: float) -> np.ndarray:
-    """Group links by squares of ground; return two group indices of each link, (n, 2).
+    """Return two group indices of each link, (n, 2): its piece of evidence, and its place.
 
-    First, links with both ends in the same squares of side `width_m`, of one device, receiver and
-    flight (a piece of evidence); then, links with both ends in those of side `place_m` (a place).
+    Both ends of its links are in the same squares of side `width_m`, or `place_m`. A piece is also
+    of one device, receiver and flight.
     """
     pieces, squares = (np.column_stack([np.floor(end[:, :2] / side_m).astype(np.int64) for end in
                                         (links.receiver_m,

@@ -65,21 +65,12 @@ class CrudeLevel:
 
 def crude_level(level_db: np.ndarray, limit_db: np.ndarray, distance_m: np.ndarray,
                 device: np.ndarray, receiver: np.ndarray) -> CrudeLevel:
-    """Predict levels by a straight line over lg distance and an offset per device and receiver.
+    """Predict levels by a line over lg distance and an offset per device and receiver.
 
-    Levels that were not detected count as below the limit, by EM for censored normal levels
+    Links (n,) that were not detected count as below the limit, by EM for censored normal levels
     (Dempster, Laird and Rubin 1977, 'Maximum likelihood from incomplete data via the EM algorithm',
-    JRSS B 39, Sec. 4.2).
-
-    Args:
-        level_db: (n,) readings [dB]; NaN: not detected.
-        limit_db: (n,) weakest level that each receiver detects [dB]; -inf: unknown.
-        distance_m: (n,) [m]; NaN: unknown.
-        device: (n,) index of each link's device.
-        receiver: (n,) index of each link's receiver.
-
-    Returns:
-        the predicted level of each link [dB], and the standard deviation of its error [dB].
+    JRSS B 39, Sec. 4.2). A distance is NaN if unknown, a limit -inf. Returned are the predicted
+    level of each link [dB], and the standard deviation of its error [dB].
     """
     blank = np.isnan(level_db)
     limited = blank & np.isfinite(limit_db)
@@ -154,12 +145,8 @@ def receiver_limit(level_db: np.ndarray, mean_db: np.ndarray, scale_db: np.ndarr
                    ) -> LimitEstimate | None:
     """Estimate the weakest level that one receiver detects; None with few readings or blanks.
 
-    Args:
-        level_db: (n,) readings [dB]; NaN: not detected.
-        mean_db: (n,) predicted levels [dB].
-        scale_db: (n,) scale of their errors, Student-t with `DOF` degrees of freedom [dB].
-        links_per_observation: number of links that count as one, see `design_effect`.
-        declared_db: declared limit to compare with [dB]; -inf: none.
+    Of n readings [dB] (NaN: not detected), the predicted level and its error scale (Student-t,
+    `DOF`) are given. `links_per_observation`, see `design_effect`, count as one.
     """
     blank = np.isnan(level_db)
     read_db = np.sort(level_db[~blank])
@@ -187,10 +174,8 @@ def _log_likelihoods(tried_db: np.ndarray, read_db: np.ndarray, mean_db: np.ndar
                      ) -> tuple[np.ndarray, float]:
     """Return the log-likelihood [nats] of candidate limits of detection (k,), and of no limit.
 
-    Given are the readings, ascending, and for the blanks (not detected) the predicted level
-    `mean_db` and its error `scale_db` (m,), all in dB. A blank is below the limit, or lost at any
-    level; the lost share and the width of the transition are averaged over.
-    `links_per_observation` links count as one observation.
+    Readings ascend; of the blanks (m,) the predicted level and its error are given [dB]. A blank is
+    below the limit, or lost at any level; lost share and width of the transition are averaged over.
     """
     readings, blanks = len(read_db), len(mean_db)
     mean_db = np.round(mean_db / BIN_DB) * BIN_DB
@@ -214,13 +199,8 @@ def _log_likelihoods(tried_db: np.ndarray, read_db: np.ndarray, mean_db: np.ndar
 def estimate_limits(links: Links, declared_db: float | None) -> tuple[np.ndarray, list[str]]:
     """Estimate the weakest level that each receiver detects, and test the limit that is declared.
 
-    Args:
-        links: n links; their present limits are ignored.
-        declared_db: limit that the scene declares [dB]; None: it declares none.
-
-    Returns:
-        (n,) limit of each link [dB], -inf if neither the readings nor a declared limit give one;
-        and notes, a sentence each.
+    The present limits are ignored. Returned is the limit (n,) of each link [dB], -inf if neither
+    the readings nor `declared_db` give one, and notes.
     """
     declared = -np.inf if declared_db is None else declared_db
     ignored = _reason_to_ignore(links, declared)
@@ -255,9 +235,7 @@ def estimate_limits(links: Links, declared_db: float | None) -> tuple[np.ndarray
 def _reason_to_ignore(links: Links, declared_db: float) -> str | None:
     """Return why a declared limit of detection is ignored, a sentence; None if it may be right.
 
-    It is ignored if at least `MIN_BLANKS` links are blank (not detected), but all readings are
-    `FAR_DB` or more above it: of levels that vary continuously, some would lie just above a real
-    limit.
+    Of levels that vary continuously, some would lie just above a real limit.
     """
     readings, lowest_db = int(np.isfinite(links.level_db).sum()), _lowest_db(links.level_db)
     blanks = len(links) - readings
@@ -281,9 +259,8 @@ def _usual_db(links: Links, rows: list[np.ndarray], found: list[LimitEstimate | 
               pooled: LimitEstimate | None, declared_db: float) -> float | None:
     """Return the limit [dB] for receivers without an estimate of their own; None if unknown.
 
-    It is the declared limit, unless more than half of the receivers' sure estimates (without any:
-    the estimate from all links) overrule it. Else it is the median of these estimates, else the
-    estimate from all links, else the lowest reading.
+    The declared one, unless most sure estimates overrule it; else their median, else the estimate
+    from all links, else the lowest reading.
     """
     sure = [(each, part) for each, part in zip(found, rows, strict=True) if each and each.is_sure]
     if np.isfinite(declared_db):
@@ -308,8 +285,8 @@ def contradict_limit(read_db: np.ndarray, limit_db: float) -> bool:
 def _overrules(found: LimitEstimate, read_db: np.ndarray, declared_db: float) -> bool:
     """Return whether an estimated limit of detection is to replace the declared one.
 
-    It is if both differ by more than their errors explain and the likelihood is clearly against the
-    declared limit, unless a few readings (n,) [dB] reach down to that.
+    They must differ by more than their errors explain, the likelihood be clearly against the
+    declared limit, and no readings (n,) [dB] reach down to that.
     """
     rise_db = found.limit_db - declared_db
     off_db = max(rise_db - RISE_DB, -rise_db - FALL_DB)
@@ -320,10 +297,7 @@ def _overrules(found: LimitEstimate, read_db: np.ndarray, declared_db: float) ->
 
 def _estimates(links: Links, rows: list[np.ndarray], declared_db: float,
                ) -> tuple[list[LimitEstimate | None], LimitEstimate | None]:
-    """Estimate the limit of detection of each receiver, and one limit from all links together.
-
-    `rows` are the links of each receiver. An estimate is None where readings or blanks are too few.
-    """
+    """Estimate the limit of each receiver, by its links `rows`, and of all together."""
     blank = np.isnan(links.level_db)
     if not blank.any():
         return [None] * len(rows), None
@@ -356,11 +330,7 @@ def _lowest_db(level_db: np.ndarray) -> float:
 
 def _notes(links: Links, rows: list[np.ndarray], limits_db: np.ndarray,
            found: list[LimitEstimate | None], declared_db: float, lost: list[int]) -> list[str]:
-    """Note receivers whose limit is not the declared one, limits that differ, and lost links.
-
-    `rows` are the links of each receiver; `limits_db` and `found` its limit [dB] and the estimate,
-    if any; `lost` the receivers whose links are blank at any level.
-    """
+    """Note receivers whose limit is not the declared one, limits that differ, and `lost` links."""
     unit, notes = links.level_unit, []
     other = [r for r, limit_db in enumerate(limits_db)
              if np.isfinite(declared_db) and limit_db != declared_db]
@@ -411,9 +381,8 @@ def _limit_text(name: str, limit_db: float, found: LimitEstimate | None, unit: s
 def with_usual_limits(links: Links) -> Links:
     """Give receivers that detect too little the usual limit of detection, not their own.
 
-    Blanks (not detected) that are predicted above this limit then need another explanation. Such a
-    receiver is clearly less sensitive than most, or has blanks at any level. If no limit is known,
-    the lowest reading is taken for the limit of all.
+    Blanks that are predicted above it then need another explanation. If no limit is known, the
+    lowest reading is taken for the limit of all.
     """
     usual_db = links.usual_limit_db
     if usual_db is None:

@@ -41,22 +41,11 @@ def is_table_of_links(frame: pd.DataFrame) -> bool:
 
 def links_of_frame(frame: pd.DataFrame, origin: Origin | None
                    ) -> tuple[pd.DataFrame, Origin | None, tuple[str, ...]]:
-    """Convert a data frame of another layout to a table of links.
+    """Convert a data frame of another layout to a table of links; return its origin and notes, too.
 
     Receiver positions may be in any columns that a table of sites may have, such as `lat` and
-    `lon`. Without a column `flight` or `receiver`, all links are of a flight or receiver `1`.
-
-    Args:
-        frame: with a level, a device and a receiver position in each row.
-        origin: of the local frame of x and y; None: unknown, and the middle of latitudes and
-            longitudes becomes the origin.
-
-    Returns:
-        the table, with other columns unchanged; its origin; and notes on columns that were not
-        used.
-
-    Raises:
-        BadInput: a column is missing, or a value cannot be used (with row and column).
+    `lon`. Without a column `flight` or `receiver`, all links are of one `1`. Without an origin, the
+    middle of latitudes and longitudes becomes it. BadInput names row and column.
     """
     table, notes = frame.reset_index(drop=True), tuple[str, ...]()
     require_level(FRAME, table)

@@ -424,10 +424,7 @@ def _read_devices(path: Path, origin: Origin | None,
 
 
 def _devices_of_links(table: pd.DataFrame) -> pd.DataFrame:
-    """Make the table of devices from columns `device_x_m, …`, by the first link of each device.
-
-    A device with a position is an anchor, others are unknown.
-    """
+    """Make the table of devices from columns `device_x_m, …`, by the first link of each device."""
     first = table.drop_duplicates("device").reset_index(drop=True)
     position_m = first.reindex(columns=DEVICE_POSITION).astype(float).to_numpy()
     placed = np.isfinite(position_m[:, :2]).all(axis=1)
@@ -437,11 +434,9 @@ def _devices_of_links(table: pd.DataFrame) -> pd.DataFrame:
 
 def _devices(path: Path | str, cells: pd.DataFrame, origin: Origin | None, own: Origin | None,
              where: Callable[[int], str]) -> tuple[pd.DataFrame, tuple[str, ...]]:
-    """Make the table of devices, and notes, from the cells of a table of their positions.
+    """Make the table of devices, and notes, from cells, with x and y from the frame `own`.
 
-    Without a column `role`, devices with a position are anchors. `origin` is that of the
-    measurements' frame, `own` that of the cells' x and y; `where` gives the place of a row in the
-    file.
+    They are converted to `origin`. Without a column `role`, devices with a position are anchors.
     """
     sites = read_site_table(path, cells, where, "device", [*DEVICE_OPTIONAL, "antenna", "role"])
     names, values = sites.names, sites.values
@@ -464,18 +459,10 @@ def _devices(path: Path | str, cells: pd.DataFrame, origin: Origin | None, own: 
 
 def read_antenna_files(path: Path, names: Iterable[str], are_rows: bool = True
                        ) -> dict[str, bytes]:
-    """Read the antenna files that a table names in its column `antenna`.
+    """Read the antenna files, name -> content, that a table names in its column `antenna`.
 
-    Args:
-        path: of the table; the files are in or below its folder.
-        names: cells of the column; empty: no file.
-        are_rows: whether there is one name for each row, so that messages can name the row.
-
-    Returns:
-        name -> content.
-
-    Raises:
-        BadInput: a file is missing, outside the folder, or no antenna pattern.
+    They are in or below its folder; an empty name is no file. With `are_rows` there is a name for
+    each row, for messages. BadInput if one is missing, outside, or no antenna pattern.
     """
     files = {}
     for row, name in enumerate(names):
@@ -495,8 +482,7 @@ def _check_spread(path: Path, table: pd.DataFrame, devices_path: Path,
                   devices: pd.DataFrame) -> None:
     """Raise BadInput if some anchors are more than `MAX_APART_M` from the middle of the receivers.
 
-    An anchor is a device of declared position. If all are so far away, links and devices are in
-    different frames, which is checked later, with the scene.
+    If all are, links and devices are in different frames, which is checked later, with the scene.
     """
     middle_m = table[["receiver_x_m", "receiver_y_m"]].median().to_numpy()
     anchor = (devices["role"] == "anchor").to_numpy()

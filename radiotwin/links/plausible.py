@@ -53,12 +53,9 @@ _RANGES: dict[str, tuple[float, float, str]] = {
 
 def refuse_implausible(refuse: Callable[[np.ndarray, str], None], name: str,
                   numbers: np.ndarray) -> None:
-    """Refuse values outside the plausible range of their column, which may be in a wrong unit.
+    """Refuse values (n,) outside the plausible range of their column, which may be in a wrong unit.
 
-    Args:
-        refuse: called with a mask (n,) of bad values and the reason; raises if any is true.
-        name: column of `measurements.csv` or `devices.csv`.
-        numbers: (n,) in the column's unit; NaN: empty.
+    `refuse` is called with a mask (n,) of bad values and the reason; it raises if any is true.
     """
     for ending, (low, high, reason) in _RANGES.items():
         if name == ending or name.endswith(ending):
@@ -107,16 +104,9 @@ def far_notes(place: np.ndarray, middle: np.ndarray, axes: tuple[str, str],
               where: Callable[[int], str], what: str) -> list[str]:
     """Note sites that are more than `FAR_M` from the readings or the map.
 
-    Args:
-        place: (k, 2) latitude and longitude [deg], or x and y [m], of the sites; NaN: unknown.
-        middle: (2,) middle of the readings or of the map.
-        axes: names of the two coordinates.
-        where: row -> file and site, for messages.
-        what: name of `middle` in messages, such as `the middle of the receivers`.
-
-    Raises:
-        BadInput: the farthest site is farther away than any link is long, or a typing error
-            explains its position: swapped coordinates, a wrong sign, a shifted decimal point.
+    `place` (k, 2) are latitude and longitude [deg], or x and y [m], NaN: unknown; `middle` (2,) is
+    called `what` in messages, and a row `where(row)`. BadInput if the farthest site is farther away
+    than any link is long, or a typing error explains its position.
     """
     apart_m = _distance_m(place, middle, axes)
     far = np.flatnonzero(apart_m > FAR_M)  # not of NaN
@@ -135,9 +125,8 @@ def far_notes(place: np.ndarray, middle: np.ndarray, axes: tuple[str, str],
 def _slip(place: np.ndarray, middle: np.ndarray, axes: tuple[str, str]) -> str:
     """Guess which typing error put a position (2,) too far away, as a question; `""` if none.
 
-    Tried are swapped coordinates, wrong signs and shifted decimal points: an error is found if its
-    correction lies within `FAR_M` of `middle` (2,). Around the origin of a local frame nothing is
-    tried, as dividing any x and y by ten often enough would bring them there.
+    Around the origin of a local frame nothing is tried, as dividing any x and y by ten often enough
+    would bring them there.
     """
     if "latitude" not in axes and np.linalg.norm(middle) <= FAR_M:
         return ""
@@ -177,14 +166,7 @@ def distances_m(place_deg: np.ndarray, middle_deg: np.ndarray) -> np.ndarray:
 
 def unmatched_notes(path: Path | str, names: Iterable[str], read: Collection[str], end: str
                     ) -> list[str]:
-    """Note names that only a table of sites has, and names that only the log has.
-
-    Args:
-        path: of the table.
-        names: in the table.
-        read: names in the log.
-        end: `device` or `receiver`.
-    """
+    """Note names that only a table of sites has, and names that only the log (`read`) has."""
     idle = list(dict.fromkeys(name for name in names if name not in read))
     lacking = sorted(set(read) - set(names))
     notes, file = [], Path(path).name

@@ -148,10 +148,9 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
 
 def _clearance_m(declared_z_m: np.ndarray, device_m: np.ndarray, receiver_m: np.ndarray,
                  scene: Scene | None) -> np.ndarray:
-    """Return the heights (k,) [m] of devices above the ground.
+    """Return the heights (k,) [m] of devices above the ground; NaN if not declared.
 
-    Without a map, they are above the lowest receiver or z = 0, whichever is higher. NaN if a
-    device's height is not declared.
+    Without a map, they are above the lowest receiver or z = 0, whichever is higher.
     """
     if scene is not None:
         return declared_z_m - _ground_m(scene, device_m, receiver_m)
@@ -161,10 +160,7 @@ def _clearance_m(declared_z_m: np.ndarray, device_m: np.ndarray, receiver_m: np.
 
 
 def _ground_m(scene: Scene, device_m: np.ndarray, receiver_m: np.ndarray) -> np.ndarray:
-    """Return the ground height (k,) [m] below devices.
-
-    For a device of unknown position it is the median below the receivers.
-    """
+    """Return the ground height (k,) [m] below devices; where unknown, the receivers' median."""
     city, unknown = scene.city, np.isnan(device_m[:, 0])
     below_m = np.zeros(len(device_m))
     below_m[~unknown] = city.ground_height_m(*device_m[~unknown, :2].T)

@@ -166,8 +166,7 @@ class _Known:
 def _known_names(projected: bool) -> dict[str, _Known]:
     """Return the known column names of a table of sites, each with its quantity and unit.
 
-    `convert` of an entry turns its numbers into the quantity's unit; it is None if the name has no
-    unit. With `projected`, names of projected coordinates such as `easting` are included.
+    With `projected`, names of projected coordinates such as `easting` are included.
     """
     found: dict[str, _Known] = {}
 
@@ -262,13 +261,8 @@ class SiteTable:
     def local_m(self, origin: Origin | None, own: Origin | None, what: str) -> np.ndarray:
         """Return positions (k, 3) [m] in a local frame; NaN: unknown, or z is above the ground.
 
-        Args:
-            origin: of the target frame; None: unknown.
-            own: origin of the frame in which the columns x and y are; None: the target frame.
-            what: owner of the target frame, for messages.
-
-        Raises:
-            BadInput: latitudes without an origin, or x, y that contradict latitude and longitude.
+        The frame is about `origin`, and `what` has it; x and y are about `own`, None: the same.
+        BadInput for latitudes without an origin, or x, y that contradict latitude and longitude.
         """
         if "latitude" in self.values and origin is None and "x" not in self.values:
             raise BadInput(f"{self.path}: latitude and longitude need the origin of the frame of "
@@ -498,11 +492,9 @@ def _numbers(table: SiteTable, quantity: str, convert: Convert | None, length_un
 
 
 def _number_with_unit(text: str, name: str, quantity: str, crs: bool) -> tuple[float, float]:
-    """Read a cell with a unit, such as `30 m`, `100'`, `20 W`, as one of two numbers.
+    """Read a cell with a unit, such as `30 m`, `100'`, `20 W`, in the quantity's unit; NaN if none.
 
-    The first is in the quantity's unit. If the column's name has the same unit as the cell, it is
-    NaN, and the second is the number as written. Both are NaN for an unreadable cell or another
-    unit.
+    If the column's name has the same unit, the number as written is the second one instead.
     """
     found = _WITH_UNIT.fullmatch(text) if len(text) <= _DMS_CHARACTERS else None
     nothing = (np.nan, np.nan)

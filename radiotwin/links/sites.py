@@ -113,14 +113,10 @@ def repeats_at_places(links: Links) -> Repeats:
 
 
 def shared_names(links: Links) -> dict[int, str]:
-    """Find devices that may be two transmitters with one name, such as two carriers of a cell.
+    """Find devices that may be two transmitters with one name: index -> the reason, for a note.
 
-    A receiver then reads two levels at one time, or at one place. A device is found if such
-    repeated readings scatter by more than `SHARED_DB`, and by `SHARED_RATIO` times as much as
-    usual.
-
-    Returns:
-        device index -> the reason, for a note.
+    A receiver then reads two levels at one time, or at one place: these scatter by more than
+    `SHARED_DB`, and by `SHARED_RATIO` times as much as usual.
     """
     found: dict[int, str] = {}
     timed = links.select(np.isfinite(links.time_s))
@@ -201,10 +197,8 @@ class ReceiverDifference:
 def receiver_differences(links: Links) -> list[ReceiverDifference]:
     """Estimate the difference of level [dB] between every two receivers at the same places.
 
-    Returns:
-        a difference for each two receivers with `MIN_PAIRS` or more pairs of readings at
-        `MIN_PLACES` or more places; empty if devices move (receivers are fixed then), or with more
-        than `MAX_RECEIVERS` receivers.
+    Two need `MIN_PAIRS` pairs of readings at `MIN_PLACES` places; none if devices move (receivers
+    are fixed then), or with more than `MAX_RECEIVERS` receivers.
     """
     members = np.unique(links.receiver[np.isfinite(links.level_db)])
     if not 2 <= len(members) <= MAX_RECEIVERS or devices_move(links):
@@ -215,11 +209,7 @@ def receiver_differences(links: Links) -> list[ReceiverDifference]:
 
 
 def _difference(links: Links, first: int, second: int) -> ReceiverDifference | None:
-    """Estimate how much higher the second receiver reads than the first [dB], with its interval.
-
-    The medians at each place are averaged, with outliers clipped. None if the two share too few
-    readings or places.
-    """
+    """Estimate how much higher the second receiver reads; None with too few readings or places."""
     pairs = _pairs(links, first, second)
     if len(pairs) < MIN_PAIRS:
         return None
@@ -243,12 +233,8 @@ def _difference(links: Links, first: int, second: int) -> ReceiverDifference | N
 def _pairs(links: Links, first: int, second: int) -> pd.DataFrame:
     """Pair each reading of a receiver with the nearest one of another receiver, per device.
 
-    Only pairs within `SAME_M` whose mean level is `ABOVE_LIMIT_DB` or more above both limits of
-    detection count: weaker ones would be missing at the less sensitive receiver.
-
-    Returns:
-        columns device, x and y of the square of ground, and the level of the second receiver minus
-        that of the first [dB].
+    Only pairs within `SAME_M` whose mean level is `ABOVE_LIMIT_DB` or more above both limits count:
+    weaker ones would be missing at the less sensitive receiver.
     """
     read = np.isfinite(links.level_db)
     parts = []

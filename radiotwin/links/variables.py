@@ -69,20 +69,10 @@ def feature_count(devices: int, declared: bool) -> int:
 
 
 def link_features(links: Links, receivers: bool = True) -> np.ndarray:
-    """Compute the inputs of a regression: geometry, angles, and one-hot device and receiver.
+    """Compute the inputs (n, p) of a regression: geometry, angles, and one-hot device and receiver.
 
     Times, and what a receiver reports beside the level, are left out, as they are unknown where a
-    map is predicted.
-
-    Args:
-        links: n links.
-        receivers: whether to include the receiver; a map is for a receiver that was not measured.
-
-    Returns:
-        (n, p): both positions [m], distance [m] and its logarithm, elevation [deg], sine and cosine
-        of the azimuth at the device, line of sight, metres inside buildings, diffraction parameter;
-        if any azimuth is declared, cosine and magnitude of the sine of the angle off boresight (0
-        for a device without one); then 0 or 1 for each device and for each receiver.
+    map is predicted; with `receivers` False, so is the receiver.
     """
     azimuth = np.radians(links.azimuth_deg)
     columns = [*links.receiver_m.T, *links.device_m[links.device].T, links.distance_m,

@@ -51,17 +51,10 @@ def of_device(table: pd.DataFrame, device: str | None) -> pd.DataFrame:
 
 def plot_links(table: pd.DataFrame, values: np.ndarray, ax: Axes, frame: PlotFrame,
                scene: Scene | None, label: str, strongest_last: bool, **look: Any) -> None:
-    """Draw a value of each link at its moving end, and the fixed ends.
+    """Draw values (n,) of links at their moving ends (NaN: not detected), and the fixed ends.
 
-    Args:
-        table: n links, with positions of both ends.
-        values: (n,) values; NaN is drawn as not detected.
-        ax: axes to draw into.
-        frame: of the axes.
-        scene: whose buildings are outlined; None: no outlines.
-        label: of the colour bar.
-        strongest_last: draw large values over small ones; else large magnitudes over small ones.
-        look: further arguments of `Axes.scatter`.
+    `strongest_last` draws large values over small ones, else large magnitudes; `label` is of the
+    colour bar, `look` goes to `Axes.scatter`.
     """
     end = moving_end(table)
     other = ENDS[1 - ENDS.index(end)]

@@ -185,10 +185,7 @@ def parts_of(shape: tuple[int, ...]) -> Iterator[tuple[slice, slice, slice]]:
 
 def write_blocks(top: xr.Dataset, dtypes: dict[str, np.dtype], blocks: Iterable[MapBlock],
                  path: Path | str) -> None:
-    """Write a radio map as compressed NetCDF-4 by the CF conventions; see `write_parts`.
-
-    HDF5 crashes if a write fails, so `atomic_file` hides write errors from it until the end.
-    """
+    """Write a radio map as compressed NetCDF-4 by the CF conventions; see `write_parts`."""
     import h5netcdf  # type: ignore[import-untyped]
 
     shape = tuple(top.sizes[name] for name in DIMS)
@@ -326,10 +323,7 @@ def axis_problem(dataset: xr.Dataset) -> str | None:
 
 
 def _values_problem(dataset: xr.Dataset) -> str | None:
-    """Check gains, sigmas and lines of sight; return the first fault, or None.
-
-    Values are read in parts of whole chunks of the file.
-    """
+    """Check gains, sigmas and lines of sight, chunk by chunk; return the first fault, or None."""
     names = [name for name in VARIABLES if name in dataset]
     regions = {name: list(_regions(dataset[name])) for name in names}
     with progress("checking the map", total=sum(map(len, regions.values()))) as advance:
@@ -392,8 +386,7 @@ def _write_zarr(top: xr.Dataset, dtypes: dict[str, np.dtype], blocks: Iterable[M
                path: Path | str) -> None:
     """Write a radio map as a Zarr folder by the CF conventions; see `write_parts`.
 
-    Each block is a chunk, so one block is in memory at a time. The folder is written under a
-    temporary name, then renamed.
+    Each block is a chunk, so one block is in memory at a time.
     """
     path = Path(path)
     _check_zarr_target(path)
@@ -447,10 +440,8 @@ def _open_zarr(path: Path) -> Iterator[xr.Dataset]:
 def open_dataset(path: Path) -> Iterator[xr.Dataset]:
     """Open a radio map, NetCDF-4 or Zarr, of which values are read on access.
 
-    All values are read once, in parts, to check them. The dataset is open until the context ends.
-
-    Raises:
-        BadInput: no such file, damaged, or not a radio map.
+    All values are read once, in parts, to check them. BadInput if there is no such file, or it is
+    damaged, or no radio map.
     """
     with _open_unchecked(path) as opened:
         dataset = _checked_map(path, opened)
@@ -460,11 +451,7 @@ def open_dataset(path: Path) -> Iterator[xr.Dataset]:
 
 
 def load_dataset(path: Path) -> xr.Dataset:
-    """Read a radio map, NetCDF-4 or Zarr, into memory.
-
-    Raises:
-        BadInput: see `open_dataset`, or the map is too large for the memory.
-    """
+    """Read a radio map, NetCDF-4 or Zarr, into memory; BadInput also if it is too large."""
     with _open_unchecked(path) as opened:
         dataset = _checked_map(path, opened, is_loaded=True)
     dataset["los"] = dataset["los"].astype(bool)
@@ -488,10 +475,7 @@ def _open_unchecked(path: Path) -> Iterator[xr.Dataset]:
 
 
 def _checked_map(path: Path, opened: xr.Dataset, is_loaded: bool = False) -> xr.Dataset:
-    """Check an opened dataset with its values; return the radio map without CF attributes.
-
-    `is_loaded`: values are read into memory first. A dataset that is no radio map is BadInput.
-    """
+    """Check an opened dataset with its values; return the radio map without CF attributes."""
     with _errors_as_bad_input(path):
         problem, dataset = form_problem(opened), opened
         if problem is None:
@@ -526,12 +510,7 @@ def _as_bool(stored: xr.Variable) -> xr.Variable:
 
 
 def check_target(path: Path | str) -> None:
-    """Check that a radio map can be written to a path; call it before long work.
-
-    Raises:
-        BadInput: the path cannot be written, or holds something else.
-        RunFailed: the disk is full.
-    """
+    """Raise BadInput unless a radio map can be written to a path; call it before long work."""
     if is_zarr(path):
         _check_zarr_target(Path(path))
     else:
@@ -551,14 +530,8 @@ def write_parts(top: xr.Dataset, dtypes: dict[str, np.dtype], blocks: Iterable[M
                 path: Path | str) -> None:
     """Write a radio map block by block, atomically: `NAME.zarr` as a Zarr folder, else NetCDF-4.
 
-    Args:
-        top: coordinates and attributes of the map.
-        dtypes: of its variables, by name.
-        blocks: all blocks of the map, in C order.
-        path: of the file or folder.
-
-    Raises:
-        BadInput: `path` cannot be written.
-        RunFailed: the disk is full or failed; an older map is unchanged.
+    `top` has coordinates and attributes, `dtypes` are of the variables, by name; all blocks follow
+    in C order. BadInput if `path` cannot be written, RunFailed if the disk is full or failed; an
+    older map is then unchanged.
     """
     (_write_zarr if is_zarr(path) else write_blocks)(top, dtypes, blocks, path)

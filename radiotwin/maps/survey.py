@@ -154,7 +154,7 @@ def _require_possible(scene: Scene, truth: RadioMap) -> None:
     """Raise BadInput if a traced link with line of sight is far above free space.
 
     The bound is the free-space gain (ITU-R P.525-4, eq. 4) between the antennas' peaks plus 12 dB,
-    or plus 24 dB if fields were added: 16 paths as strong as the direct one. Statistical truths and
+    or 24 dB if fields were added: 16 paths as strong as the direct one. Statistical truths, and
     maps of the solver `map`, which averages over cells, are not checked.
     """
     attributes = truth.dataset.attrs
@@ -318,8 +318,7 @@ def declared_devices(scene: Scene) -> pd.DataFrame:
 def fly(scene: Scene, uav: UavConfig, pattern: str, rng: np.random.Generator) -> np.ndarray:
     """Simulate one flight of a UAV; return its cells (slots, 2) from start to terminal.
 
-    Raises:
-        BadInput: the battery does not reach from the start to the terminal.
+    BadInput if the battery does not reach from the one to the other.
     """
     lattice = scene.lattice
     start, terminal = ((round((y_m - lattice.y_m[0]) / lattice.step_m),
@@ -349,8 +348,7 @@ def _lattice_index(scene: Scene, uav: UavConfig, cells: np.ndarray) -> np.ndarra
 def heading_deg(cells: np.ndarray) -> np.ndarray:
     """Return the heading (slots,) [degrees clockwise from north] along cells (slots, 2).
 
-    A slot has the heading of the last move, slots before the first move that of the first move. A
-    UAV that never moves has heading 0.
+    It is that of the last move, before the first one that of the first, without any 0.
     """
     moves = np.diff(cells, axis=0)
     heading = pd.Series(np.full(len(cells), np.nan))
@@ -363,14 +361,8 @@ def link_table(scene: Scene, flight: str, receiver: str, index: np.ndarray, leve
                time_s: np.ndarray, heading_deg: np.ndarray) -> pd.DataFrame:
     """Return the measurements of one receiver on one flight as rows of `Measurements.table`.
 
-    Args:
-        scene: devices and lattice.
-        flight: name.
-        receiver: name.
-        index: (slots,) flat index of the receiver's position in the lattice.
-        level_db: (devices, slots) gain [dB]; NaN: not detected.
-        time_s: (slots,) [s].
-        heading_deg: (slots,) [degrees].
+    It was at the flat indices (slots,) of the lattice, and read levels (devices, slots) [dB]; NaN:
+    not detected.
     """
     devices, slots = len(level_db), len(index)
     position_m = scene.lattice.positions_m[index]

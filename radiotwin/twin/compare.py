@@ -213,14 +213,9 @@ def _check(test: Measurements, scene: Scene, truth: RadioMap | None,
 
 def true_positions(scene: Scene,
                    measurements: Measurements) -> dict[str, tuple[float, float, float]]:
-    """Return the true positions of measured devices, as far as they are declared.
+    """Return the true positions (x, y, z) [m] of measured devices by name, as far as declared.
 
-    Args:
-        scene: scene that declares devices.
-        measurements: measurements; their positions of anchors have precedence.
-
-    Returns:
-        device -> (x, y, z) [m].
+    Those of the measurements' anchors have precedence over those of the scene.
     """
     known = {d.device: (d.x_m, d.y_m, d.z_m) for d in scene.config.devices}
     known |= {row.device: (row.x_m, row.y_m, row.z_m) for row in measurements.devices.itertuples()
@@ -229,19 +224,11 @@ def true_positions(scene: Scene,
 
 
 def predict(twin: Twin, scene: Scene, measurements: Measurements) -> np.ndarray:
-    """Predict the levels of measured links, given that they are detected.
+    """Predict the levels (n,) [dB] of measured links, given that they are detected.
 
     Errors can be computed for detected links only, and near the limit of detection only the
     strongest are detected. The unconditional mean would be biased, most for the model with the
-    largest standard deviation. So every model predicts the mean given detection.
-
-    Args:
-        twin: twin that predicts.
-        scene: scene with the 3D map.
-        measurements: n links.
-
-    Returns:
-        (n,) levels [dB]; NaN for devices that the twin does not know, or could not locate.
+    largest standard deviation. NaN for devices that the twin does not know, or could not locate.
     """
     row_of = {device.device: row for row, device in enumerate(twin.devices)
               if np.isfinite([device.x_m, device.y_m]).all()}
@@ -294,14 +281,9 @@ def score_map(name: str, candidate: RadioMap, truth: RadioMap,
 
 
 def comparable_db(candidate: RadioMap, truth: RadioMap) -> np.ndarray:
-    """Return a map's gains for comparison with detected links of a truth map.
+    """Return a map's gains (device, z, y, x) [dB] for comparison with those of a truth map.
 
-    Args:
-        candidate: map; if it has a standard deviation, its mean given detection is used.
-        truth: truth map; if it has a standard deviation, too, the means are compared directly.
-
-    Returns:
-        (device, z, y, x) gain [dB]
+    If only the map has a standard deviation, they are means given detection.
     """
     gain_db = candidate.gain_db.astype(float)
     if "sigma_db" not in candidate.dataset or "sigma_db" in truth.dataset:

@@ -33,18 +33,8 @@ def fit_links(links: Links, scene: Scene, channel: type[ChannelModel], seed: int
               locator: type[ChannelModel] | None = None) -> Twin:
     """Learn a channel from the anchors' links, then locate the unknown devices with it.
 
-    Args:
-        links: n links.
-        scene: its map and extent.
-        channel: class of the channel model.
-        seed: as of `fit_twin`.
-        start: as of `fit_twin`.
-        settings: of the search.
-        locator: class of the channel model that locates, learnt from the anchors' links; None:
-            `channel`.
-
-    Raises:
-        BadInput: as of `fit_twin`.
+    Seed, `start` and errors are as of `fit_twin`. `locator` is the class of the channel model that
+    locates, learnt from the anchors' links, too; None: `channel`.
     """
     anchors_m = _anchors_m(links)
     is_anchor = np.isfinite(anchors_m).all(axis=1)
@@ -103,12 +93,7 @@ def fit_known(links: Links, channel: type[ChannelModel], seed: int) -> Twin:
 
 
 def reliable_m(devices: list[TwinDevice], max_radius_m: float = np.inf) -> np.ndarray:
-    """Return the positions (k, 3) of devices that are located well enough [m], NaN of the others.
-
-    Args:
-        devices: k devices.
-        max_radius_m: largest 90 % credible radius [m].
-    """
+    """Return positions (k, 3) [m] of devices located within a 90 % radius [m], or NaN."""
     located = np.array([each.located and each.credible_radius_m <= max_radius_m
                         for each in devices])
     return np.where(located[:, None], [each.position_m for each in devices], np.nan)
@@ -129,10 +114,7 @@ def _fit_channel(links: Links, device_m: np.ndarray, channel: type[ChannelModel]
 
 def _known_links(links: Links, device_m: np.ndarray
                  ) -> tuple[LinkGeometry, np.ndarray, np.ndarray]:
-    """Return the m links of devices with a position in `device_m` (k, 3), levels and limits (m,).
-
-    From levels and limits are subtracted the declared powers, cables and antenna gains [dB].
-    """
+    """Return the links of devices with a position (k, 3) [m], isotropic levels and limits."""
     known = np.isfinite(device_m[:, :2]).all(axis=1)[links.device]
     receiver_m, device = links.receiver_m[known], links.device[known]
     geometry = link_geometry(device_m, receiver_m, device, links.city, links.frequency_hz)
@@ -171,10 +153,7 @@ def _published(links: Links, device_m: np.ndarray, scene: Scene,
 def _locate(links: Links, scene: Scene, channel: ChannelModel, law_error: LawError | None,
             unknown: np.ndarray, seed: int, start: Twin | None,
             settings: LocalizeSettings | None) -> list[TwinDevice]:
-    """Locate the devices `unknown` (k,) by a fitted channel, or load the result of an earlier run.
-
-    `start` is an earlier twin, whose positions the search tries as well.
-    """
+    """Locate the devices `unknown` (k,) by a fitted channel, or load an earlier result."""
     start_m = None
     if start is not None:
         before = {device.device: (device.x_m, device.y_m) for device in start.devices}

@@ -46,17 +46,10 @@ PRIOR_DEVICES = 2  # weight of the likelihood's radii, in devices, beside the er
 
 def fit_along_paths(links: Links, scene: Scene, seed: int, start: Twin | None,
                     executor: Executor | None = None) -> Twin:
-    """Fit a twin that traces paths over the map as it is.
+    """Fit a twin that traces paths over the map as it is; arguments are as of `fit_twin`.
 
     Fitted are levels and error scales in LoS and NLoS, and the diffuse power. Warns if paths
     explain the levels worse than a log-distance law does.
-
-    Args:
-        links: n links over the map.
-        scene: scene with the map.
-        seed: of the law.
-        start: an earlier twin, see `fit_twin`; None: none.
-        executor: see `fit_twin`.
     """
     law = fit_links(links, scene, SegmentedLogDistance, seed)
     twin = fit_paths(links, scene, law, relocation_from(scene, np.inf, start, executor))
@@ -92,16 +85,9 @@ def fit_along_paths(links: Links, scene: Scene, seed: int, start: Twin | None,
 
 
 def fit_paths(links: Links, scene: Scene, law: Twin, relocation: Relocation) -> Twin:
-    """Locate unknown devices along paths, and fit the diffuse power of `paths`.
+    """Locate unknown devices along paths, from the positions of a law, and fit the diffuse power.
 
-    Args:
-        links: n links.
-        scene: scene with the map.
-        law: twin of a log-distance law; its positions start the search.
-        relocation: the search along paths, with its cache.
-
-    Returns:
-        a twin with the channel `paths`, whose levels are not fitted yet.
+    The levels of the twin's channel are not fitted yet.
     """
     # For the search, use unreliable devices, too, whose links tell of deep shadow.
     channel = _image_paths(links, law, law.device_m)
@@ -114,13 +100,8 @@ def relocation_from(scene: Scene, max_radius_m: float, start: Twin | None = None
                     executor: Executor | None = None) -> Relocation:
     """Set up a search for unknown devices by tracing paths.
 
-    Args:
-        scene: its extent bounds the search.
-        max_radius_m: devices with a larger 90 % radius by the log-distance law are not searched
-            [m].
-        start: an earlier twin; its devices with a small radius are searched only around their
-            positions in it and by the law.
-        executor: searches for several devices at once; None: one after the other.
+    Devices with a 90 % radius by the law above `max_radius_m` [m] are not searched; those with a
+    small radius in an earlier twin only around their positions in it and by the law.
     """
     sure = [device for device in start.devices if device.role == "unknown" and device.located
             and device.credible_radius_m <= SURE_M] if start else []
@@ -132,10 +113,7 @@ def relocation_from(scene: Scene, max_radius_m: float, start: Twin | None = None
 def best_dof(links: Links, channel: ChannelModel, device_m: np.ndarray) -> float:
     """Return those degrees of freedom of Student-t errors in DOFS with the greatest likelihood.
 
-    Args:
-        links: n links.
-        channel: fitted channel.
-        device_m: (k, 3) positions of the devices [m]; NaN: unknown.
+    Devices are at (k, 3) [m]; NaN: unknown.
     """
     model = Model.build(links, channel, DOFS[0], device_m=device_m)
     objectives = [replace(model, dof=dof).fit().objective for dof in DOFS]
@@ -153,18 +131,11 @@ def _image_paths(links: Links, law: Twin, device_m: np.ndarray) -> ImagePaths:
 
 def fit_over_wrong_map(links: Links, scene: Scene, seed: int, start: Twin | None,
                        executor: Executor | None = None) -> Twin:
-    """Fit a twin that traces paths over a map with errors, which are estimated.
+    """Fit a twin that traces paths over a map with errors; arguments are as of `fit_twin`.
 
     The map's shift is estimated from the anchors' links; devices are located along paths on the
     shifted map. Errors of walls and roofs widen the radii, and so do the position errors of some
     anchors that are located as if they were unknown.
-
-    Args:
-        links: n links over the map.
-        scene: scene with the map.
-        seed: of the channel, and of the random maps.
-        start: an earlier twin, see `fit_twin`; None: none.
-        executor: see `fit_twin`.
     """
     shift_m = _shift(links, seed)
     on_map = _moved(links, shift_m)
@@ -228,10 +199,10 @@ def _with_copies(links: Links) -> Links:
 
 
 def _calibrated(devices: list[TwinDevice], links: Links) -> list[TwinDevice]:
-    """Drop the copies of anchors, and scale all radii by how far the copies were located from them.
+    """Drop the copies of anchors, and scale all radii by how far they were located from these.
 
-    The copies were located as if unknown. A normal distribution with 90 % radius r has the mean
-    square error r² / ln 10. The factor is at least 1.
+    A normal distribution with 90 % radius r has the mean square error r² / ln 10. The factor is at
+    least 1.
     """
     count = len(links.device_names)
     ratios = [PRIOR_DEVICES]
@@ -253,10 +224,7 @@ def _estimate_errors(links: Links, devices: list[TwinDevice], shift_m: Shift, se
 
 
 def _channel(links: Links, devices: list[TwinDevice], found: Found, seed: int) -> PathKriging:
-    """Fit `PathKriging`, with the map errors `found`, to located devices, or load it.
-
-    Devices with a 90 % radius above LOST_M are predicted by kriging only.
-    """
+    """Fit `PathKriging` to located devices, or load it; lost ones are predicted by kriging only."""
     lost = tuple(np.flatnonzero(~np.isfinite(reliable_m(devices, LOST_M)).all(axis=1)).tolist())
     known = links.with_located_devices(reliable_m(devices))
     data = *known.gains(PathKriging(found).declared_db(known)), seed
@@ -270,9 +238,8 @@ def _radius_by_map_m(links: Links, devices: list[TwinDevice], channel: ImagePath
                      ) -> np.ndarray:
     """Return the 90 % radius (k,) [m] of the position errors that errors of the map cause.
 
-    Devices are located again over `cities`, wrong copies of the map; how far they move gives the
-    variance, equal on both axes and normal (F distribution for few maps). 0 if paths never locate
-    the device.
+    It is from how far devices move over `cities`, wrong copies of the map (F distribution for few
+    of them); 0 if paths never locate the device.
     """
     squares: list[list[float]] = [[] for _ in devices]
     known = {device.device: [(device.x_m, device.y_m)] for device in devices}

@@ -30,20 +30,11 @@ def law_of(channel: ChannelModel) -> LogDistance | SegmentedLogDistance | None:
 
 def law_parameters(channel: ChannelModel, links: LinkGeometry, level_db: np.ndarray,
                    limit_db: Limit, seed: int) -> list[dict[str, Any]]:
-    """Return the parameters of a channel's log-distance law with 90 % intervals.
+    """Return a channel's log-distance law with 90 % intervals, as rows of `COLUMNS`; None: unknown.
 
     The intervals are by a delete-a-group jackknife (Kott 2001, 'The delete-a-group jackknife',
-    Journal of Official Statistics 17). All links of a block (`ground_blocks`) are in one group.
-
-    Args:
-        channel: channel fitted to the links.
-        links: n links.
-        level_db: (n,) levels, see `ChannelModel.fit` [dB].
-        limit_db: limits of detection, see `ChannelModel.fit` [dB].
-        seed: of the groups.
-
-    Returns:
-        rows of `COLUMNS`; low and high are None if unknown.
+    Journal of Official Statistics 17). All links of a block (`ground_blocks`) are in one group. The
+    n links are those of the fit, see `ChannelModel.fit`.
     """
     law = law_of(channel)
     if law is None:
@@ -69,10 +60,8 @@ def parameters_of(channel: ChannelModel, refit_db: np.ndarray, sd_db: np.ndarray
                   ) -> list[dict[str, Any]]:
     """Return a channel's log-distance law as `close-loop` refitted it, as rows of `COLUMNS`.
 
-    Args:
-        channel: channel before the refit.
-        refit_db: coefficients of `ChannelModel.level_columns`; empty: not refitted.
-        sd_db: standard deviations by `ChannelModel.error_group` [dB]; empty: those of the law.
+    `refit_db` are coefficients of `ChannelModel.level_columns`, `sd_db` by
+    `ChannelModel.error_group`; empty: those of the law.
     """
     law = law_of(channel)
     if law is None:
@@ -110,8 +99,7 @@ def _rows(law: LogDistance | SegmentedLogDistance, values: np.ndarray, spread: n
           ) -> list[dict[str, Any]]:
     """Return rows of `COLUMNS` from `_values` and the half widths `spread` of their intervals.
 
-    Where `spread` is NaN, or a line is borrowed, the interval is None. The standard deviation, a
-    logarithm in `values`, is returned in dB.
+    Where `spread` is NaN, or a line is borrowed, the interval is None.
     """
     borrowed = getattr(law, "borrowed", None)
     names = [(links, parameter, unit) for links in _lines(law)

@@ -126,8 +126,7 @@ def _with_receivers_of(links: Links, names: Sequence[str]) -> Links:
 def _by_channel(twin: Twin, links: Links) -> FittedModel:
     """Return a model of the twin's fast law (if it traces paths) or of its trend, without effects.
 
-    Its error scales are the median standard deviations that the law states for the twin's devices
-    at the receivers of the links.
+    Its error scales are the law's medians for the twin's devices at the receivers of the links.
     """
     channel = twin.channel.quick if twin.channel.follows_paths else twin.channel.trend
     known = np.isfinite(twin.device_m).all(axis=1)
@@ -145,11 +144,7 @@ def _by_channel(twin: Twin, links: Links) -> FittedModel:
 
 
 def _widening(model: FittedModel, links: Links, found: list[TwinDevice]) -> float:
-    """Return the factor, at least 1, by which radii grow as links fit worse than in training.
-
-    It is the ratio of residuals, in error scales, of located devices (median) and of training
-    devices; 1 if it is below MIN_WIDENING or unknown.
-    """
+    """Return the factor, at least 1, by which radii grow as links fit worse than in training."""
     if np.isnan(model.typical_misfit) or not found:
         return 1.0
     row = {name: row for row, name in enumerate(links.device_names)}

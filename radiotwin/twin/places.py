@@ -37,16 +37,9 @@ class Places:
              origin: Origin | None, city: CityMap | None) -> Places:
         """Convert a user's places to receiver positions and device rows.
 
-        Args:
-            given: a data frame, an array (n, 3) of x, y, z [m], or None.
-            columns: numbers, names or arrays (n,), added to the data frame as columns.
-            devices: names of all devices; without a column `device`, each is paired with each
-                place.
-            origin: origin of the local frame; None: unknown.
-            city: the 3D map; None: the ground is at z = 0.
-
-        Raises:
-            BadInput: a column is missing, or a value is wrong (with its row and column).
+        They are a data frame, an array (n, 3) of x, y, z [m], or None, with numbers, names or
+        arrays (n,) of further columns. Without a column `device`, each device is paired with each
+        place. BadInput names row and column.
         """
         frame = _frame(given, columns)
         sites = receivers_of_frame(frame)

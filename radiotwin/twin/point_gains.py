@@ -47,19 +47,10 @@ def export_ns3(source: Twin | RadioMap, scene: Scene, points_m: np.ndarray, fold
 
 def gains_at(source: Twin | RadioMap, scene: Scene, points_m: np.ndarray,
              devices: Sequence[str]) -> np.ndarray:
-    """Return channel gains from devices to points.
+    """Return channel gains (k, n) [dB] from devices to points (n, 3) [m].
 
-    Args:
-        source: twin, which predicts the mean even below sensitivity, or radio map.
-        scene: scene of the twin or map.
-        points_m: (n, 3) positions [m]; for a map, on its lattice.
-        devices: names of k devices that have a position.
-
-    Returns:
-        (k, n) gain [dB]; NaN inside buildings, and in gaps of a map.
-
-    Raises:
-        BadInput: points off the lattice of a map, or twin or map in another frame than the scene.
+    A twin predicts the mean even below sensitivity. NaN inside buildings, and in gaps of a map.
+    BadInput if points are off the lattice of a map, or it is in another frame than the scene.
     """
     points_m = np.asarray(points_m, dtype=float).reshape(-1, 3)
     inside = scene.city.inside(points_m)

@@ -43,19 +43,9 @@ class HeldOut:
            seed: int, models: tuple[str, ...] = CHEAP) -> HeldOut | None:
         """Compute the errors of channel models on links of the anchors that their fits left out.
 
-        Each model is fitted once without each fold of flights or, with few flights, of ground
-        blocks.
-
-        Args:
-            links: n links of the anchors.
-            flight: (n,) index of each link's flight.
-            level_db: (n,) as of `ChannelModel.fit`.
-            limit_db: as of `ChannelModel.fit`.
-            seed: of the folds and of the fits.
-            models: names, simple ones first.
-
-        Returns:
-            None where too few links would be left to learn from.
+        Each model is fitted once without each fold of flights (n,) or, with few flights, of ground
+        blocks. Levels and limits (n,) are as of `ChannelModel.fit`. None where too few links would
+        be left to learn from.
         """
         if not len(flight):
             return None
@@ -133,14 +123,10 @@ class HeldOut:
 
 
 def standard_error(value: np.ndarray, block: np.ndarray) -> float:
-    """Return the standard error of the mean of n values that are correlated within blocks.
+    """Return the standard error of the mean of values (n,) that are correlated within blocks (n,).
 
     From the sums over blocks (Cochran 1977, 'Sampling Techniques', chapter 6): links to one device
     from receivers close together have similar errors.
-
-    Args:
-        value: (n,)
-        block: (n,) index of the block of each value.
     """
     deviation = np.bincount(block, value - value.mean())
     blocks = len(deviation)

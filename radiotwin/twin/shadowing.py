@@ -43,13 +43,7 @@ class ErrorCorrelation:
 
     @classmethod
     def of(cls, twin: Twin, links: Links, seed: int) -> "ErrorCorrelation":
-        """Estimate how prediction errors are correlated in space from the residuals of a twin.
-
-        Args:
-            twin: fitted twin.
-            links: n measured links, with the twin's devices.
-            seed: of the random subset of links.
-        """
+        """Estimate how prediction errors are correlated in space from the residuals of a twin."""
         located = np.array([device.located for device in twin.devices])
         rows = _sampled(links.device, located[links.device] & np.isfinite(links.level_db), seed)
         sample = links.select(rows).with_located_devices(twin.device_m)
@@ -64,15 +58,9 @@ class ErrorCorrelation:
     def of_residuals(cls, device: np.ndarray, receiver_m: np.ndarray, residual_db: np.ndarray,
                      sd_db: np.ndarray, seed: int, field: ResidualField | None = None
                      ) -> "ErrorCorrelation":
-        """Estimate the spatial correlation of errors, and the spread of devices' levels.
+        """Estimate the spatial correlation of errors (n,) [dB], and the spread of devices' levels.
 
-        Args:
-            device: (n,) row of each link's device.
-            receiver_m: (n, 3) positions of the receivers [m].
-            residual_db: (n,) measured minus predicted [dB]; NaN: not detected.
-            sd_db: (n,) predicted standard deviation [dB].
-            seed: of the random subset of links.
-            field: field whose correlation is used; None: it is fitted.
+        Without a field, whose correlation is used, one is fitted.
         """
         rows = _sampled(device, np.isfinite(residual_db), seed)
         if not len(rows):

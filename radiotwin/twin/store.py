@@ -219,13 +219,7 @@ def encode_twin(twin: Twin) -> tuple[str, bytes]:
 def decode_twin(record: str, channel: bytes, source: object) -> dict[str, Any]:
     """Decode the files of `encode_twin` to the attributes of `Twin` by name.
 
-    Args:
-        record: content of `twin.json`.
-        channel: content of the channel's file.
-        source: path of the twin, for messages.
-
-    Raises:
-        BadInput: damaged, or an effect is not installed.
+    BadInput, with the path `source`, if they are damaged, or an effect is not installed.
     """
     given = parse_json(record, source)
     try:

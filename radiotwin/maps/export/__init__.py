@@ -29,14 +29,8 @@ def write_map(radio_map: RadioMap | MapStream, scene: Scene, path: Path,
               exporters: dict[str, Callable[[RadioMap, Scene, Path], None]]) -> None:
     """Write a map in the format of the path's suffix, block by block if the format allows it.
 
-    Args:
-        radio_map: map to write.
-        scene: of the map.
-        path: of the output; its suffix chooses the format.
-        exporters: by suffix.
-
-    Raises:
-        BadInput: the format requires the map in memory, and it is too large.
+    `exporters` are those by suffix. BadInput if the format requires the map in memory, and it is
+    too large.
     """
     if path.suffix in STREAMED:
         STREAMED[path.suffix](radio_map, scene, path)
@@ -50,16 +44,7 @@ def write_map(radio_map: RadioMap | MapStream, scene: Scene, path: Path,
 
 def check_format(path: Path, scene: Scene,
                  formats: Collection[str] = tuple(EXPORTERS)) -> None:
-    """Check that a radio map of a scene can be written in the format of a path's suffix.
-
-    Args:
-        path: of the output; its suffix chooses the format.
-        scene: of the map.
-        formats: suffixes that can be written.
-
-    Raises:
-        BadInput: an unknown suffix, or .kmz for a scene without an origin.
-    """
+    """Raise BadInput unless a map of a scene can be written in the format of a path's suffix."""
     if path.suffix not in formats:
         raise BadInput(f"{path}: unknown format {path.suffix!r}; allowed are "
                        f"{', '.join(formats)}")

@@ -94,8 +94,7 @@ class Route:
 def write_flight_files(routes: Iterable[Route], origin: Origin | None, folder: Path) -> list[str]:
     """Write `flights.csv`; with an origin also `flights.kml`, `.geojson` and a `.plan` a UAV.
 
-    Returns:
-        Names of the files written.
+    Returned are the names of the files.
     """
     tables = [route.table(origin) for route in routes]
     names = ["flights.csv"]

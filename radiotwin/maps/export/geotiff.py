@@ -73,9 +73,6 @@ def _write_parts(radio_map: RadioMap | MapStream, path: Path, profile: dict[str,
     """Write a large map to the disk block by block.
 
     GDAL hides errors of a full disk, so every block is read again and its checksum compared.
-
-    Raises:
-        RunFailed: the disk is full or failed.
     """
     import rasterio
     from rasterio.windows import Window
@@ -119,13 +116,10 @@ def require_origin(scene: Scene, purpose: str) -> Origin:
 
 def georeference(x_m: np.ndarray, y_m: np.ndarray, step_m: float,
                  origin: Origin | None) -> dict[str, Any]:
-    """Return rasterio's `crs` and `transform` of a raster, north up.
+    """Return rasterio's `crs` and `transform` of a raster with cells of `step_m`, north up.
 
-    Args:
-        x_m: (nx,) middles of the cells, ascending [m].
-        y_m: (ny,) likewise [m].
-        step_m: side of a cell [m].
-        origin: of the local frame; None: no reference system, coordinates are local metres.
+    `x_m` and `y_m` are middles of the cells, ascending [m]. Without an origin there is no reference
+    system, and coordinates are local metres.
     """
     import rasterio
 
@@ -157,8 +151,7 @@ def _window(block: MapBlock, height: int) -> tuple[slice, slice]:
 def cell_size_m(radio_map: RadioMap | MapStream, scene: Scene) -> float:
     """Return the side of a map's cells [m]: its lattice's step, or the scene's for one position.
 
-    Raises:
-        BadInput: the positions are not evenly spaced.
+    BadInput if the positions are not evenly spaced.
     """
     step_m = radio_map.lattice.step_m or scene.config.lattice.step_m
     for axis_m in (radio_map.lattice.x_m, radio_map.lattice.y_m):

@@ -85,18 +85,10 @@ def write_kmz(radio_map: RadioMap, scene: Scene, path: Path) -> None:
 def write_overlays(path: Path, scene: Scene, bounds_m: tuple[float, float, float, float],
                    overlays: list[Overlay], marks: dict[str, tuple[float, float]],
                    legend: bytes) -> None:
-    """Write a KMZ file of pictures over one area.
+    """Write a KMZ file of pictures over one area, which are sorted by folder.
 
-    Args:
-        path: of the .kmz file.
-        scene: with an origin.
-        bounds_m: (x_min, x_max, y_min, y_max) of every picture [m].
-        overlays: pictures, sorted by folder.
-        marks: x and y of points to mark, by name [m].
-        legend: PNG for the left edge of the view.
-
-    Raises:
-        BadInput: the scene has no origin.
+    `bounds_m` are x_min, x_max, y_min, y_max of every picture [m], `marks` x and y of points by
+    name [m]; the legend is a PNG for the left edge. BadInput if the scene has no origin.
     """
     origin = require_origin(scene, f"{path}: Google Earth needs")
     ET.register_namespace("", KML)

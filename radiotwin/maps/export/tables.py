@@ -83,13 +83,9 @@ def write_numpy(radio_map: RadioMap, scene: Scene, path: Path) -> None:
 
 
 def check_map_place(name: str, attributes: dict[str, Any], scene: Scene) -> None:
-    """Check that a radio map lies where a scene does, whose origin and outlines it will be given.
+    """Raise BadInput unless a radio map has the origin of a scene, whose outlines it will be given.
 
-    Warns:
-        The map was made for another version of the scene.
-
-    Raises:
-        BadInput: map and scene have different origins.
+    A warning says if it was made for another version of the scene.
     """
     origin = scene.config.origin
     for key, value in ({} if origin is None else origin.model_dump()).items():

@@ -61,12 +61,7 @@ WORKER_BYTES = 2 * 2**30  # memory of a process that searches
 
 def followed_since(known: dict[tuple[float, ...], int], followed: Followed
                    ) -> dict[str, np.ndarray]:
-    """Return path powers that were cached since `known` as arrays for a file, for `add_followed`.
-
-    Args:
-        known: number of cached links of each device position before.
-        followed: the cache: position -> hash of the receiver -> path power.
-    """
+    """Return path powers cached since each position had `known` links, as arrays for a file."""
     new = {position_m: list(powers.items())[known.get(position_m, 0):]
            for position_m, powers in followed.items() if len(powers) > known.get(position_m, 0)}
     ends = [end for powers in new.values() for end in powers]
@@ -115,13 +110,8 @@ class Relocation:
                  channel: ImagePaths) -> list[TwinDevice]:
         """Move unknown devices to the positions of greatest likelihood along paths.
 
-        A device keeps its position unless paths explain its links better than the law. If more than
-        `MAX_DEVICES` are unknown, all keep theirs.
-
-        Args:
-            links: n links over a map.
-            devices: devices as located by the channel's law.
-            channel: channel that traces paths.
+        A device keeps its position by the law unless paths explain its links better, and all do if
+        more than `MAX_DEVICES` are unknown.
         """
         unknown = sum(device.role == "unknown" for device in devices)
         if unknown > MAX_DEVICES:
@@ -196,8 +186,7 @@ class Relocation:
     def _rows(self, links: Links, device: int) -> np.ndarray:
         """Choose about LINKS links of a device, by a hash of the receiver position.
 
-        So every subset of links, such as a fold, uses the same receivers, whose path powers are
-        cached.
+        So every subset of links, such as a fold, uses the same receivers, whose powers are cached.
         """
         rows = np.flatnonzero(links.device == device)
         hashes = _hashes(links.receiver_m[rows])
@@ -209,16 +198,10 @@ class Relocation:
 
     def follow(self, links: Links, device: int, candidates: Candidates | None = None
                ) -> tuple[np.ndarray, Candidates | None]:
-        """Return the path power of a device's links, from the cache or newly traced.
+        """Return the path power (n,) of a device's links, cached or newly traced, linear.
 
-        Args:
-            links: n links with the device at the tried position.
-            device: row of the device.
-            candidates: sequences of interactions to try; None: all that rays find.
-
-        Returns:
-            (n,) power gain through the declared antennas, linear; and the strongest candidates at
-            this position if all paths were traced, else None.
+        It is through the declared antennas. If all paths were traced (no `candidates` given), the
+        strongest candidates at this position are returned, too.
         """
         assert links.city is not None
         position_m = tuple(map(float, links.device_m[device]))
@@ -312,13 +295,9 @@ class _Search:
     def from_law(self, device: TwinDevice, known: list[tuple[float, float]]) -> TwinDevice:
         """Return a device at its likeliest position by traced paths, or unchanged.
 
-        It is unchanged if the log-distance law explains its links as well at its position, or if
-        its residuals by paths are much larger than those of other devices (MAX_MISFIT).
-
-        Args:
-            device: device as located by the law.
-            known: positions found from other subsets of links; if there are any, only their
-                surroundings and the law's position are tried.
+        It is unchanged if the law explains its links as well, or its residuals by paths are much
+        larger than those of other devices (MAX_MISFIT). With positions `known` from other subsets
+        of links, only their surroundings and the law's position are tried.
         """
         start_m = np.array([device.x_m, device.y_m])
         known_m = self._free(np.array(known).reshape(-1, 2))
@@ -436,10 +415,9 @@ class _Search:
 
     def _paths_nll(self, asked: tuple[_Place, Candidates | None]
                    ) -> tuple[float, Candidates | None]:
-        """Return the negative log-likelihood by paths [nats] of a position.
+        """Return the negative log-likelihood of a position [nats], and its strongest candidates.
 
-        `asked` is the position and the candidates (interactions) to try, or None: all. Also returns
-        the strongest candidates, if all were tried.
+        Tried are the given candidates, None: all; only then are there strongest ones.
         """
         position_m, candidates = asked
         links = self.by_paths.at(np.array(position_m))
@@ -478,10 +456,7 @@ class _Search:
                             reading.mean_db, likelihood.fit.model.level_at)
 
     def _radius_m(self, best: _Place, design_effect: float) -> float:
-        """Return the radius around the best position with 90 % of the tried positions' probability.
-
-        Each position is weighted by the square of the distance to its nearest neighbour [m].
-        """
+        """Return the radius around the best position with 90 % of the tried ones' probability."""
         positions_m, values = np.array(list(self.tried)), np.array(list(self.tried.values()))
         apart_m = np.linalg.norm(positions_m[:, None] - positions_m, axis=2)
         area = np.where(apart_m > 0, apart_m, np.inf).min(axis=1) ** 2
@@ -507,10 +482,7 @@ def _search_alone(searches: list[_Question], number: int) -> Piece:
 
 def _cells(around_m: np.ndarray, reach_m: float,
            bounds: tuple[float, float, float, float]) -> np.ndarray:
-    """Return centres (c, 2) of grid cells within bounds and `reach_m` of a position, whole metres.
-
-    The grid is the same for all positions, unless more than MAX_CELLS make it coarser.
-    """
+    """Return centres (c, 2) of grid cells within bounds and reach of a position, whole metres."""
     low, high = np.array(bounds[::2]), np.array(bounds[1::2])
     low, high = np.maximum(around_m - reach_m, low), np.minimum(around_m + reach_m, high)
     cell_m = max(CELL_M, float(np.sqrt(np.prod(np.maximum(high - low, 0)) / MAX_CELLS)))

@@ -53,11 +53,7 @@ def calibrate_radii(models: list[FittedModel], held_out: list[Links], area_m: Ar
                     seed: int) -> RadiusCalibration:
     """Calibrate 90 % radii by locating anchors from held-out links as if they were unknown.
 
-    Args:
-        models: a model for each fold, fitted to the other folds.
-        held_out: links of each fold, with devices at their true positions.
-        area_m: see `locate`.
-        seed: of the random choice of anchors.
+    There is a model for each fold, fitted to the other folds, and the fold's links.
     """
     with_map = held_out[0].city is not None
     trials = [(model, links, device) for model, links in zip(models, held_out, strict=True)
@@ -97,8 +93,7 @@ def _enough_links(links: Links) -> np.ndarray:
 def radius_factor(ratios: np.ndarray) -> float:
     """Return the factor, at least 1, by which 90 % radii must grow to hold 90 % of the devices.
 
-    Args:
-        ratios: (n,) position error over 90 % radius of located devices.
+    Ratios (n,) are position error over 90 % radius.
     """
     rank = int(np.ceil(CREDIBLE * (len(ratios) + 1)))
     if rank <= len(ratios):
@@ -113,11 +108,6 @@ def misfit(model: FittedModel, device_links: Links, device: TwinDevice) -> float
     """Return the mean square of a located device's residuals over their scale, outliers clipped.
 
     The device's own level is first estimated and subtracted, with shrinkage.
-
-    Args:
-        model: fitted model.
-        device_links: links of the device.
-        device: the device at its estimated position.
     """
     fit = fit_elsewhere(model, device_links, np.array([[device.x_m, device.y_m]]))
     problem = fit.model.regression()

@@ -95,16 +95,10 @@ class LawError:
     @classmethod
     def learnt(cls, channel: Channel, by_class: bool, links: LinkGeometry,
                level_db: np.ndarray) -> LawError:
-        """Estimate how well a channel's level and slope are known from the links it was fitted to.
+        """Estimate how well level and slope of a channel are known from the n links of its fit.
 
         As in a weighted least-squares line, with the sandwich covariance A^-1 (sum_ij rho_ij x_i
         x_j') A^-1, since residuals of one device are correlated between receivers.
-
-        Args:
-            channel: fitted channel.
-            by_class: True if it distinguishes LoS and NLoS.
-            links: n training links.
-            level_db: (n,) measured levels [dB]; NaN: not detected.
         """
         detected = np.flatnonzero(np.isfinite(level_db))
         links, level_db = links.select(detected), level_db[detected]
@@ -138,10 +132,7 @@ def _law_columns(links: LinkGeometry, by_class: bool) -> np.ndarray:
 
 def _score_covariance(residuals: DeviceResiduals, columns: np.ndarray,
                       correlation: np.ndarray) -> np.ndarray:
-    """Return a device's score covariance (p, p), sum_ij rho_ij c_i c_j' of columns (n, p).
-
-    The sum is over all pairs of links; rho is `correlation`, by the distance of the receivers.
-    """
+    """Return a device's score covariance (p, p), sum_ij rho_ij c_i c_j' of columns (n, p)."""
     bins = np.minimum((squareform(pdist(residuals.receiver_m)) / BIN_M).astype(int), N_BINS)
     rho = np.append(correlation, 0.0)[bins]
     np.fill_diagonal(rho, 1.0 / residuals.links_per_row)  # pairs grow with the square of links
@@ -151,12 +142,8 @@ def _score_covariance(residuals: DeviceResiduals, columns: np.ndarray,
 def residual_correlation(devices: list[DeviceResiduals]) -> np.ndarray:
     """Estimate the correlation of residuals by distance between receivers, pooled over devices.
 
-    Args:
-        devices: residuals of each device.
-
-    Returns:
-        (N_BINS,) correlation in bins of BIN_M; 0 from the first bin that is not significant, so
-        that uncorrelated data give zeros.
+    The result (N_BINS,) is 0 from the first bin of BIN_M that is not significant, so that
+    uncorrelated data give zeros.
     """
     product, pairs, square, n = np.zeros(N_BINS), np.zeros(N_BINS), 0.0, 0
     for residuals in devices:
@@ -179,13 +166,10 @@ def residual_correlation(devices: list[DeviceResiduals]) -> np.ndarray:
 def design_effect(residuals: DeviceResiduals, correlation: np.ndarray) -> float:
     """Return the design effect, at least 1, by which to divide a device's log-likelihood.
 
-    It is how much correlated errors widen the position's variance: trace(H^-1 J) / 2, where H =
-    sum_i a_i a_i' and J = sum_ij (rho_ij + l_i l_j') a_i a_j' over links, with slopes a of the
-    levels and errors l of the law. It is multiplied by the mean square residual if that is above 1.
-
-    Args:
-        residuals: residuals of the device.
-        correlation: (N_BINS,) correlation by distance, see `residual_correlation`.
+    It is how much errors with a correlation (N_BINS,) widen the position's variance: trace(H^-1 J)
+    / 2, where H = sum_i a_i a_i' and J = sum_ij (rho_ij + l_i l_j') a_i a_j' over links, with
+    slopes a of the levels and errors l of the law. It is multiplied by the mean square residual if
+    that is above 1.
     """
     if len(residuals.z) < 3:
         return 1.0
@@ -231,14 +215,10 @@ class Likelihood:
     repeat_share: float = 1.0
 
     def of_devices(self, devices: Sequence[int] | np.ndarray, xy_m: np.ndarray) -> np.ndarray:
-        """Return the log-likelihood (k, p) [nats] of devices at the same candidate positions.
+        """Return the log-likelihood (k, p) [nats] of devices at candidate positions (p, 2) [m].
 
         Line of sight is computed once for all devices, and so is the channel if it does not
         distinguish devices.
-
-        Args:
-            devices: (k,) indices in `observations.devices`.
-            xy_m: (p, 2) positions [m].
         """
         observed = [self.observations.devices[k] for k in devices]
         rows = np.unique(np.concatenate([part for data in observed
@@ -256,29 +236,16 @@ class Likelihood:
         return total
 
     def link_at(self, k: int, xy_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Predict the links between one position of a device and the receivers that detected it.
-
-        Args:
-            k: index in `observations.devices`.
-            xy_m: (2,) position [m].
-
-        Returns:
-            (n,) mean [dB], and (n,) standard deviation [dB].
-        """
+        """Predict mean and sd (n,) [dB] of a device's detected links at a position (2,) [m]."""
         data = self.observations.devices[k]
         los = self._line_of_sight(xy_m[None], data.seen)
         mean_db, sd_db = self.channel.look_up(xy_m[None], data.seen, los, data.device)
         return self._with_declared(mean_db, xy_m[None], data.seen, data.device)[0], sd_db[0]
 
     def residuals(self, k: int, xy_m: np.ndarray) -> DeviceResiduals:
-        """Return standardised residuals of a device's levels, repeats merged, and their slopes.
+        """Return standardised residuals (n,) of a device at a position (2,) [m], and their slopes.
 
-        Args:
-            k: index in `observations.devices`.
-            xy_m: (2,) position of the device [m].
-
-        Returns:
-            n residuals, with slopes at constant line of sight.
+        Repeats are merged, and slopes are at constant line of sight.
         """
         data = self.observations.devices[k]
         mean_db, sd_db = self.link_at(k, xy_m)

@@ -69,14 +69,10 @@ class Observations:
 
 def merge_repeats(receiver_m: np.ndarray, device: np.ndarray, level_db: np.ndarray,
                   devices: np.ndarray, *, use_missed: bool) -> Observations:
-    """Merge the measurements of each device at each receiver position (equal to the millimetre).
+    """Merge the measurements (n,) of each device at each receiver position (to the millimetre).
 
-    Args:
-        receiver_m: (n, 3) positions of the receivers [m].
-        device: (n,) device index of each measurement.
-        level_db: (n,) levels [dB]; NaN: not detected.
-        devices: (k,) indices of the devices to keep, in this order.
-        use_missed: keep measurements that were not detected.
+    Those of the `devices` (k,) are kept, in this order, and with `use_missed` those that were not
+    detected (NaN), too.
     """
     rows = np.isin(device, devices)
     receiver_m, device, level_db = receiver_m[rows], device[rows], level_db[rows]
@@ -121,14 +117,7 @@ class LinkTable:
 
     def __init__(self, channel: Channel, receiver_m: np.ndarray, z_m: float,
                  reach_m: float) -> None:
-        """Tabulate a channel.
-
-        Args:
-            channel: to tabulate.
-            receiver_m: (r, 3) positions of all receivers [m].
-            z_m: height of the devices [m].
-            reach_m: largest horizontal distance [m].
-        """
+        """Tabulate a channel from devices at a height to receivers (r, 3), up to `reach_m` away."""
         rise, step = receiver_m[:, 2] - z_m, 0.01
         while len(levels := np.unique(np.round(rise / step))) > MAX_LEVELS:
             step *= 2.0
@@ -149,16 +138,9 @@ class LinkTable:
 
     def look_up(self, xy_m: np.ndarray, rows: np.ndarray, los: np.ndarray,
                 device: int) -> tuple[np.ndarray, np.ndarray]:
-        """Look up the prediction of links between p device positions and c receivers.
+        """Look up mean and sd (p, c) [dB] of links between positions (p, 2) [m] and receivers (c,).
 
-        Args:
-            xy_m: (p, 2) positions of the device [m].
-            rows: (c,) receivers, as rows of `receiver_m`.
-            los: (p, c) bool, line of sight.
-            device: index of the device; not used, since a table is for all devices.
-
-        Returns:
-            (p, c) float32 mean [dB], and (p, c) float32 standard deviation [dB].
+        Line of sight (p, c) is given; a table is for all devices.
         """
         xy_m = xy_m.astype(np.float32)
         at = (xy_m[:, :1] - self._x[rows]) ** 2
@@ -202,19 +184,10 @@ class DirectChannel:
 def tabulate(channel: Channel, receiver_m: np.ndarray, z_m: float,
              bounds: tuple[float, float, float, float], devices: np.ndarray,
              rng: np.random.Generator) -> LinkTable | DirectChannel:
-    """Tabulate a channel if a table reproduces its predictions at random links.
+    """Tabulate a channel if a table reproduces its predictions at random links, else return it.
 
-    Args:
-        channel: to tabulate.
-        receiver_m: (r, 3) positions of all receivers [m].
-        z_m: height of the devices [m].
-        bounds: x_min, x_max, y_min, y_max of the devices [m].
-        devices: (k,) indices of the devices at that height.
-        rng: random state.
-
-    Returns:
-        a table if all predictions agree to MEAN_TOLERANCE_DB and SD_TOLERANCE; otherwise the
-        channel itself.
+    They must agree to MEAN_TOLERANCE_DB and SD_TOLERANCE for all `devices` (k,), which are at the
+    height `z_m` within the bounds [m].
     """
     x_min, x_max, y_min, y_max = bounds
     corners = np.array([[x, y] for x in (x_min, x_max) for y in (y_min, y_max)])
@@ -239,14 +212,9 @@ def tabulate(channel: Channel, receiver_m: np.ndarray, z_m: float,
 
 def link_grid(xy_m: np.ndarray, z_m: float, receiver_m: np.ndarray, los: np.ndarray,
               device: int) -> LinkGeometry:
-    """Pair every position of a device with every receiver: p * c links, positions slowest.
+    """Pair every position (p, 2) of a device with every receiver (c, 3): p * c, positions slowest.
 
-    Args:
-        xy_m: (p, 2) positions of the device [m].
-        z_m: its height [m].
-        receiver_m: (c, 3) positions of the receivers [m].
-        los: (p, c) bool, line of sight.
-        device: index of the device.
+    Line of sight is (p, c).
     """
     p, c = los.shape
     device_m = np.repeat(np.column_stack([xy_m, np.full(p, z_m)]), c, axis=0)

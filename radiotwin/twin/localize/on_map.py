@@ -118,27 +118,16 @@ class Search:
         return allowed
 
     def log_likelihood(self, k: int, xy_m: np.ndarray) -> np.ndarray:
-        """Return the log-likelihood (p,) of one device at positions [nats]; -inf: not allowed.
-
-        Args:
-            k: index in `Observations.devices`.
-            xy_m: (p, 2) positions [m].
-        """
+        """Return the log-likelihood (p,) of a device at positions (p, 2); -inf: not allowed."""
         value = np.full(len(xy_m), -np.inf)
         allowed = self.allowed(xy_m)
         value[allowed] = self.likelihood.of_devices([k], xy_m[allowed])[0]
         return value
 
     def scan(self, coarser: float = 1.0) -> Scan:
-        """Evaluate every device's log-likelihood over the whole map.
+        """Evaluate every device's log-likelihood over the map; BadInput if no point is allowed.
 
-        The cells are as small as the settings' number of links allows.
-
-        Args:
-            coarser: factor on the width of the cells.
-
-        Raises:
-            BadInput: no point is allowed.
+        The cells are as small as the settings' number of links allows, times `coarser`.
         """
         x_min, x_max, y_min, y_max = self.bounds
         is_direct = isinstance(self.likelihood.channel, DirectChannel)
@@ -172,17 +161,7 @@ def _centres(low: float, high: float, width: float) -> np.ndarray:
 
 def distinct_modes(xy_m: np.ndarray, log_likelihood: np.ndarray, n_modes: int,
                    separation_m: float) -> np.ndarray:
-    """Choose the likeliest of scanned positions that are far enough from each other.
-
-    Args:
-        xy_m: (p, 2) positions [m].
-        log_likelihood: (p,) [nats]; -inf: not allowed.
-        n_modes: greatest number of positions.
-        separation_m: least distance between two of them [m].
-
-    Returns:
-        (at most n_modes, 2) positions [m], likeliest first.
-    """
+    """Return the likeliest of positions (p, 2) [m], at most n_modes, far from each other."""
     modes = np.empty((0, 2))
     left = np.isfinite(log_likelihood)
     while left.any() and len(modes) < n_modes:
@@ -196,25 +175,12 @@ def swarm_search(log_likelihood: Callable[[np.ndarray, np.ndarray], np.ndarray],
                  centre_m: np.ndarray, device: np.ndarray, anywhere_m: np.ndarray,
                  start_sd_m: float, particles: int, iterations: int, rng: np.random.Generator,
                  advance: Callable[[int], None] = lambda n: None) -> tuple[np.ndarray, np.ndarray]:
-    """Run s particle swarms, and return the best position that each of them found.
+    """Run s particle swarms; return their best positions (s, 2) [m] and log-likelihoods (s,).
 
-    Two thirds of a swarm start around its centre, the first particle at the centre itself; the
-    others start anywhere, so that a swarm can leave a poor mode.
-
-    Args:
-        log_likelihood: function from positions (p, 2) [m] and devices (p,) to (p,) [nats]; -inf:
-            not allowed.
-        centre_m: (s, 2) centre of each swarm [m].
-        device: (s,) device that each swarm searches.
-        anywhere_m: (a, 2) positions from which the last third of the starts is drawn [m].
-        start_sd_m: standard deviation of starts around the centre [m].
-        particles: particles of each swarm.
-        iterations: iterations of each swarm.
-        rng: random state.
-        advance: called with 1 after each iteration.
-
-    Returns:
-        (s, 2) best positions [m], and their log-likelihoods (s,) [nats].
+    Two thirds of a swarm start around its centre (s, 2), the first particle at the centre itself;
+    the others start anywhere (a, 2), so that a swarm can leave a poor mode. The log-likelihood of
+    positions (p, 2) and devices (p,) is -inf where none is allowed. `advance` is called with 1
+    after each iteration.
     """
     s = len(centre_m)
     x = centre_m[:, None] + start_sd_m * rng.standard_normal((s, particles, 2))
@@ -314,7 +280,6 @@ def _set_repeat_share(searches: list[Search], observations: Observations) -> Non
     """Set `Likelihood.repeat_share` of all searches: how much repeats at one position vary.
 
     It is their variance over the channel's, at the likeliest cells of a coarse scan, at most 1.
-    Unchanged without repeats.
     """
     repeats = sum(int((data.count - 1).sum()) for data in observations.devices)
     if repeats == 0:
@@ -334,7 +299,7 @@ def _run_swarms(searches: list[Search], scans: list[Scan], start_m: np.ndarray,
                 ) -> dict[int, np.ndarray]:
     """Run a swarm from each likely position of each device; return their best ones (s, 2) [m].
 
-    Likely are distinct modes of the scan, and the earlier estimate in `start_m` if there is one.
+    Likely are distinct modes of the scan, and an earlier estimate in `start_m`.
     """
     search_of = {k: search for search in searches for k in search.likelihood.devices}
     centres, whose = [], []

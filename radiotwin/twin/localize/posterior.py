@@ -89,14 +89,9 @@ class Posterior:
 
 
 def second_mode(modes: list[tuple[np.ndarray, float]]) -> tuple[float, float, float] | None:
-    """Return the heaviest mode that is far enough from the first mode.
+    """Return the heaviest mode far enough from the first, (x_m, y_m, weight), or None.
 
-    Args:
-        modes: positions (2,) [m] and weights, heaviest first.
-
-    Returns:
-        (x_m, y_m, weight), at least MODE_SEPARATION_M away and of MIN_MODE_WEIGHT; None: no such
-        mode.
+    It is at least MODE_SEPARATION_M away and of MIN_MODE_WEIGHT.
     """
     first = modes[0][0]
     for xy_m, weight in modes[1:]:
@@ -110,15 +105,9 @@ def refine(log_likelihood: Callable[[np.ndarray], np.ndarray], centre_m: np.ndar
            likelihood_power: float) -> Posterior:
     """Split the likeliest cells of a scan until they are below FINEST_M, and normalise all.
 
-    Args:
-        log_likelihood: function from positions (p, 2) [m] to (p,) [nats]; -inf: not allowed.
-        centre_m: (c, 2) centres of the scan's cells [m].
-        point_m: (c, 2) points at which they were evaluated [m].
-        value: (c,) log-likelihood at the points [nats].
-        width_m: width of the scan's cells [m].
-        peaks_m: (s, 2) positions whose cells are always split, because a peak may be narrower than
-            a cell [m].
-        likelihood_power: power of the likelihood for the posterior, at most 1.
+    Cells have centres (c, 2), points at which they were evaluated (c, 2), and values (c,). Those of
+    `peaks_m` (s, 2) are always split, because a peak may be narrower than a cell. The power of the
+    likelihood is at most 1.
     """
     cell_m = centre_m
     done = []

@@ -54,11 +54,7 @@ class PositionPosterior:
            ) -> PositionPosterior:
         """Compute the log-likelihood of a device's position, on coarse cells, then on fine ones.
 
-        Args:
-            model: fitted model; its receiver indices are those of the links.
-            device_links: links of one device.
-            area_m: where the device may be.
-            power: power of the likelihood by which fine cells are chosen.
+        Fine cells are chosen by that power of the likelihood.
         """
         coarse_m, width_m = _grid(area_m)
         coarse = position_log_likelihood(model, device_links, coarse_m)
@@ -84,16 +80,9 @@ class PositionPosterior:
 
 def locate(model: FittedModel, links: Links, area_m: Area,
            on_progress: Callable[[], None] = lambda: None) -> Iterator[TwinDevice]:
-    """Locate each device of the links; their positions are ignored, except for the heights.
+    """Locate each device of the links with at least `MIN_LINKS` links; its height is declared.
 
-    Args:
-        model: fitted model; its receiver indices are those of the links.
-        links: links of the devices.
-        area_m: where the devices may be.
-        on_progress: called after each device.
-
-    Yields:
-        position and radius of each device with at least `MIN_LINKS` links.
+    The model's receiver indices are those of the links. `on_progress` is called after each device.
     """
     for device in np.unique(links.device):
         device_links = links.select(links.device == device)
@@ -113,13 +102,7 @@ def whole_area(model: FittedModel, links: Links) -> Area:
 
 def position_log_likelihood(model: FittedModel, device_links: Links,
                             positions_m: np.ndarray) -> np.ndarray:
-    """Return the log-likelihood (c,) of one device's links, by candidate position [nats].
-
-    Args:
-        model: fitted model; its receiver indices are those of the links.
-        device_links: links of one device.
-        positions_m: (c, 2) candidate positions, at the height of the device in the links [m].
-    """
+    """Return the log-likelihood (c,) [nats] of one device's links by position (c, 2) [m]."""
     cells = max(LINKS_AT_ONCE // len(device_links), 1)
     return np.concatenate([
         _log_likelihood_at(model, device_links, positions_m[first:first + cells])
@@ -141,15 +124,9 @@ def _log_likelihood_at(model: FittedModel, device_links: Links, positions_m: np.
 
 
 def fit_elsewhere(model: FittedModel, device_links: Links, positions_m: np.ndarray) -> Fit:
-    """Apply a model to one device's links, repeated for each candidate position of the device.
+    """Apply a model to one device's n links, at each of its candidate positions (c, 2) [m].
 
-    Args:
-        model: fitted model; its receiver indices are those of the links.
-        device_links: n links of one device.
-        positions_m: (c, 2) candidate positions, at the height of the device in the links [m].
-
-    Returns:
-        the model on c * n links, positions slowest.
+    The device keeps its height. The result has c * n links, positions slowest.
     """
     n, cells, known = len(device_links), len(positions_m), len(model.device_m)
     height_m = np.full(cells, device_links.device_m[device_links.device[0], 2])
@@ -163,11 +140,7 @@ def fit_elsewhere(model: FittedModel, device_links: Links, positions_m: np.ndarr
 
 def _finer(log_likelihood: np.ndarray, power: float, coarse_m: np.ndarray,
            width_m: float) -> tuple[np.ndarray, float]:
-    """Split the likeliest coarse cells, which hold the probability HELD, into finer ones.
-
-    The likelihood is raised to `power` before. Returns centres (c, 2) and width of the fine cells
-    [m].
-    """
+    """Split the likeliest coarse cells, which hold HELD; return fine cells (c, 2) and width [m]."""
     share = _normalised(power * log_likelihood)
     order = np.argsort(-share)
     held = order[:int(np.searchsorted(np.cumsum(share[order]), HELD)) + 1]

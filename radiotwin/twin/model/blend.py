@@ -38,36 +38,21 @@ MAX_SD_RATIO = 100.0  # largest in a file
 
 
 def far_share(away_m: np.ndarray, half_m: float) -> np.ndarray:
-    """Return how much weights for places far from measurements count (n,): d / (d + half).
-
-    Args:
-        away_m: (n,) distance d to the nearest measurement [m]; inf: no measurement.
-        half_m: distance of equal near and far shares [m].
-    """
+    """Return how much far weights count (n,), by the distance to the nearest measurement [m]."""
     return 1 - half_m / (away_m + half_m)
 
 
 def sd_factor(share: np.ndarray, sd_ratio: tuple[float, float]) -> np.ndarray:
-    """Return the factor (n,) on error scales, between that near and that far from measurements.
-
-    Args:
-        share: (n,) share of the far weights, see `far_share`.
-        sd_ratio: factor near measurements, and far from them.
-    """
+    """Return the factor (n,) on error scales, between that near and that far from measurements."""
     near, far = np.square(sd_ratio)
     return np.sqrt((1 - share) * near + share * far)
 
 
 def blended(predicted_db: np.ndarray, scales_db: np.ndarray, share: np.ndarray,
             weights: np.ndarray, sd_ratio: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Combine the predictions of several models to one mean and error scale (n,) [dB].
+    """Combine predictions and error scales (n, k) [dB] of k models to one of each (n,) [dB].
 
-    Args:
-        predicted_db: (n, k) level predicted by each predictor [dB].
-        scales_db: (n, k) error scale of each predictor [dB].
-        share: (n,) share of the far weights, see `far_share`.
-        weights: (2, k) weights near measurements, and far from them.
-        sd_ratio: see `Blend`.
+    Weights (2, k) are near measurements, and far from them, see `far_share` and `Blend`.
     """
     scale_db = np.sqrt(combine(np.square(scales_db), share, weights))
     return combine(predicted_db, share, weights), scale_db * sd_factor(share, sd_ratio)
@@ -103,8 +88,7 @@ class Blend:
     def away_m(self, links: Links) -> np.ndarray:
         """Return the distance (n,) [m] of each link's moving end from its nearest measurement.
 
-        The moving end is the receiver or the device, see `receivers_move`. Only measurements with
-        the same other end count; inf: none.
+        Only measurements with the same other end count; inf: none.
         """
         moving_m, other = moving_ends(links, self.receivers_move)
         away_m = np.full(len(links), np.inf)
@@ -118,13 +102,8 @@ class Blend:
                     shadowing: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Return level (n, k) and error scale (n, k) [dB] of each model, in the order of `weights`.
 
-        Args:
-            links: n links.
-            mean_db: (n,) level by channel and named effects [dB].
-            scale_db: (n,) its error scale, also taken for trees [dB].
-            dof: degrees of freedom of the errors.
-            shadowing: (n,) interpolated residual [error scales], and (n,) share of the scale that
-                then remains.
+        Those of channel and named effects are given (n,), and the shadowing as of
+        `CorrelatedShadowing.at`.
         """
         levels = {NAMED: mean_db, SHADOWED: mean_db + shadowing[0] * scale_db}
         scales = dict.fromkeys(self.weights, scale_db) | {SHADOWED: shadowing[1] * scale_db}
@@ -184,17 +163,9 @@ class Blend:
     @classmethod
     def from_state(cls, arrays: dict[str, np.ndarray], settings: dict[str, Any],
                    devices: int) -> Self:
-        """Restore a blend from its `state`, after checking it.
+        """Restore a blend from its `state`, after checking it, for a twin with so many devices.
 
-        Args:
-            arrays: arrays of `state`.
-            settings: settings of `state`.
-            devices: number of devices of the twin.
-
-        Raises:
-            BadInput: too large.
-            ValueError: damaged.
-            KeyError: a part is missing.
+        BadInput if it is too large, ValueError or KeyError if it is damaged.
         """
         require_names("settings", settings, ["weights", "half_m", "sd_ratio", "receivers_move",
                                               "models"])

@@ -83,13 +83,9 @@ class Relatives:
     @classmethod
     def fit(cls, links: Links, z: np.ndarray, field: ResidualField | None,
             seed: int) -> Relatives | None:
-        """Fit how residuals follow those of relatives (devices on one mast); None: too few links.
+        """Fit how residuals (n,) follow those of relatives (devices on one mast); None: too few.
 
-        Args:
-            links: n links with moving receivers.
-            z: (n,) residuals [error scales].
-            field: field whose correlation is used; None: it is fitted.
-            seed: of random subsets of points.
+        Without a field, whose correlation is used, one is fitted.
         """
         heard = set(np.unique(links.device).tolist())
         devices = [(device, np.flatnonzero(np.isin(links.device, relatives)))
@@ -187,14 +183,9 @@ class CorrelatedShadowing:
     @classmethod
     def fit(cls, links: Links, train: np.ndarray, z: np.ndarray, seed: int,
             like: CorrelatedShadowing | None = None) -> CorrelatedShadowing:
-        """Fit the interpolation over space to the residuals of a model's training links.
+        """Fit the interpolation over space to the residuals (m,) of a model's training links.
 
-        Args:
-            links: n links.
-            train: (n,) bool, the m training links.
-            z: (m,) residuals of the training links [error scales].
-            seed: of random subsets of points.
-            like: shadowing whose correlations are used; None: they are fitted.
+        The mask `train` (n,) is of all links. The correlations are those of `like`, if given.
         """
         move = like.receivers_move if like else receivers_move(links)
         links, relatives = links.select(train), None
@@ -211,10 +202,9 @@ class CorrelatedShadowing:
         return cls(field, relative_sd, move, like is None or like.certain, relatives)
 
     def at(self, links: Links) -> tuple[np.ndarray, np.ndarray]:
-        """Interpolate the residual (n,) at links [error scales], and the error that remains.
+        """Interpolate the residual (n,) at links [error scales], and return the scale's share left.
 
-        The remaining error is a share (n,) of the error scale, 1 far from measurements or if not
-        `certain`.
+        That is 1 far from measurements, or if not `certain`.
         """
         mean, sd = self.field.predict(*_points(links, self.receivers_move))
         mean = self.relative_sd * mean
@@ -233,12 +223,7 @@ class CorrelatedShadowing:
 
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> CorrelatedShadowing:
-        """Restore the interpolation from its `state`.
-
-        Raises:
-            ValueError: damaged.
-            KeyError: a part is missing.
-        """
+        """Restore the interpolation from its `state`; ValueError or KeyError if it is damaged."""
         record = _State.model_validate(state)
         relatives = None if record.relatives is None else Relatives.of(record.relatives)
         return cls(record.field, record.relative_sd, record.receivers_move, record.certain,
@@ -249,8 +234,7 @@ def _points(links: Links,
             receivers_move: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Return series, position (n, 3) [m] and kind (n,) of links, as `ResidualField.fit` takes them.
 
-    The series (n,) is the fixed end of the link, the position is that of the moving end. If
-    receivers move, the kind is the receiver, so that each has an error of its own.
+    If receivers move, the kind is the receiver, so that each has an error of its own.
     """
     position_m, series = moving_ends(links, receivers_move)
     return series, position_m, links.receiver if receivers_move else None

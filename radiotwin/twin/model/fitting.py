@@ -43,15 +43,8 @@ def refine(fit: Fit, evaluations: int = EVALUATIONS, descents: int = DESCENTS,
            max_links: int = MAX_LINKS, anywhere: bool = False) -> Fit:
     """Search better parameters of the last effect by descents on the training links' likelihood.
 
-    Args:
-        fit: fit with the effect.
-        evaluations: evaluations of the objective for each parameter, in one descent.
-        descents: number of descents, one after the other.
-        max_links: most links in the objective.
-        anywhere: also start at `Variation.starts`.
-
-    Returns:
-        the fit with these parameters if it is better, else the given one.
+    Each has so many evaluations for each parameter, on at most `max_links`; with `anywhere` they
+    also start at `Variation.starts`. Returns the given fit if the new one is not better.
     """
     model, last = fit.model, fit.effects[-1]
     variation = last.variation()
@@ -99,8 +92,7 @@ def _refine_members(fit: Fit, last: Effect, variation: Variation) -> Fit:
     """Search the parameters of an effect for each member separately, on the links it changes.
 
     Members have parameters of their own, for example single devices. The rest of the model stays as
-    it is, except for a common level of these links. Returns the given fit if the new one is not
-    better.
+    it is, except for a common level of these links.
     """
     model, numbers = fit.model, variation.values.copy()
     arriving_db = model.regression().arriving(fit.coefficients)[0] - model.terms[-1].offset_db
@@ -183,16 +175,10 @@ def add_effect(fit: Fit, effect: Effect, like: Effect | None = None,
     """Add an effect to a fitted model with its likeliest parameters, or load the earlier result.
 
     The effect takes the channel's quick levels, those of its fast law; `along_paths` replaces them
-    by exact ones, from tracing paths. In a fold, levels are exact if those of `like` are.
-
-    Args:
-        fit: fit without the effect.
-        effect: effect to add.
-        like: the effect as fitted to all links, if `fit` is of a fold; None: not a fold.
-        group: (m,) bool, training links that it should explain, see `ResidualView.of_group`.
-
-    Returns:
-        the fit with the effect; None if the effect proposes no parameters for these residuals.
+    by exact ones, from tracing paths. `like` is the effect as fitted to all links, if `fit` is of a
+    fold, whose levels are exact if those of `like` are. It should explain the training links
+    `group` (m,), see `ResidualView.of_group`. None if it proposes no parameters for these
+    residuals.
     """
     inputs = (fit, effect, like) if group is None else (fit, effect, like, group)
     return cached("effect", inputs, lambda: _best_addition(fit, effect, like, group),
@@ -202,13 +188,8 @@ def add_effect(fit: Fit, effect: Effect, like: Effect | None = None,
 def along_paths(fit: Fit, without: Fit) -> Fit:
     """Refine the last effect with exact levels, from tracing paths again, in place of quick ones.
 
-    Args:
-        fit: result of `add_effect`.
-        without: the fit without the last effect.
-
-    Returns:
-        the fit with exact levels if these are better. Else the given fit, as for an effect that
-        does not use them (`Effect.always_exact`), gains too little, or changes too many links.
+    `without` is the fit without it. The given fit is returned if it is better, or the effect does
+    not use them (`Effect.always_exact`), gains too little, or changes too many links.
     """
     effect, gain_nats = fit.effects[-1], without.objective - fit.objective
     changes_few = np.count_nonzero(fit.model.terms[-1].offset_db) <= MAX_FOLLOWED_LINKS
@@ -225,12 +206,6 @@ def prepare_additions(without: Sequence[Fit], effects: Sequence[Effect], executo
 
     The results are cached (`radiotwin.runtime.pieces`), where `add_effect` finds them, equal to the
     bit. Without a cache, nothing is done.
-
-    Args:
-        without: fits without the effects.
-        effects: effects, each added by itself.
-        executor: runs the workers.
-        like: see `add_effect`.
     """
     if not executor.is_worth_it or not keeps():
         return
@@ -282,10 +257,7 @@ def _reader(model: Model, effect: Effect) -> Callable[..., Fit | None]:
 
 def _best_addition(fit: Fit, effect: Effect, like: Effect | None,
                    group: np.ndarray | None = None) -> Fit | None:
-    """Compute the result of `add_effect`: fit all proposed parameters, return the likeliest fit.
-
-    The effect proposes several kinds, such as several shapes; the best of each is refined first.
-    """
+    """Compute the result of `add_effect`: fit all proposed parameters, return the likeliest fit."""
     view = fit.view if group is None else fit.view.of_group(group)
     proposals = effect.propose(view) if like is None else like.propose_like(view)
     kinds: dict[Any, list[Effect]] = {}
@@ -305,10 +277,7 @@ def _best_addition(fit: Fit, effect: Effect, like: Effect | None,
 
 
 def _best_along_paths(fit: Fit, without: Fit) -> Fit:
-    """Compute the result of `along_paths`: take exact levels, then search parameters with them.
-
-    The search is repeated while each time gains MIN_EXACT_GAIN_NATS.
-    """
+    """Compute the result of `along_paths`, while each search gains MIN_EXACT_GAIN_NATS."""
     best = with_exact_levels(_refine_over_cached_paths(fit))
     if not _is_exact(best) and best.channel.follows_paths:
         best = _refine_exactly(best)
@@ -325,11 +294,7 @@ def _best_along_paths(fit: Fit, without: Fit) -> Fit:
 
 
 def _best_of_a_kind(fit: Fit, proposed: list[Effect], is_fold: bool) -> Fit:
-    """Fit the effects `proposed`, which differ in parameters only, and refine the best one.
-
-    Of many gains, only the MAX_PROPOSALS with the best score are fitted. A best fit that gains less
-    than MIN_GAIN_NATS is not refined.
-    """
+    """Fit the effects `proposed`, which differ in parameters only, and refine the best one."""
     tried = [fit.model.with_effects([*fit.effects, effect]) for effect in proposed]
     if proposed[0].stage == "gain" and len(tried) > MAX_PROPOSALS:  # only gains have a score
         tried.sort(key=lambda model: -fit.view.score(model.terms[-1].select(fit.train)))
@@ -347,11 +312,9 @@ def _is_exact(fit: Fit) -> bool:
 
 
 def _refine_exactly(fit: Fit) -> Fit:
-    """Search the last effect's parameters again, with exact levels, from traced paths.
+    """Search the last effect's parameters with exact levels, if they are few: paths are traced.
 
-    Starts at the optimum of quick levels, for the case that exact ones are worse there. Only for
-    few parameters, since each evaluation traces paths. Returns the given fit if the result is not
-    better.
+    It starts at the optimum of quick levels, for the case that exact ones are worse there.
     """
     last = fit.effects[-1]
     variation, exactly = last.variation(), last.exactly()
@@ -365,9 +328,7 @@ def _refine_exactly(fit: Fit) -> Fit:
 def _refine_over_cached_paths(fit: Fit, is_near: bool = False) -> Fit:
     """Search the last effect's parameters without tracing: cached paths give nearly exact levels.
 
-    An evaluation takes milliseconds, for example if an obstacle blocks some of the cached paths.
-    Returns the given fit if the effect has no such levels, or exact ones are not better at the
-    result.
+    Returns the given fit if the effect has no such levels, or exact ones are not better there.
     """
     last = fit.effects[-1]
     exact = last.exactly() if fit.channel.follows_paths else None
@@ -384,8 +345,7 @@ def _refine_over_cached_paths(fit: Fit, is_near: bool = False) -> Fit:
 def _refine_in_fold(fit: Fit, like: Effect) -> Fit:
     """Fit an effect in a fold with exact levels, near the parameters `like` found on all links.
 
-    Each parameter is tried NEAR_SHARE of its step to both sides, then all improvements together. As
-    every fold tries the same values, their traced paths are cached.
+    As every fold tries the same values, their traced paths are cached.
     """
     def fitted(effect: Effect) -> Fit:
         return fit.with_effects([*fit.effects, effect])

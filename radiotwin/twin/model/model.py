@@ -76,16 +76,11 @@ class Model:
     def build(cls, links: Links, channel: ChannelModel, dof: float, *,
               device_m: np.ndarray | None = None, train: np.ndarray | None = None,
               channel_db: np.ndarray | None = None) -> Model:
-        """Build the regression model of a channel on n links, without effects.
+        """Build the regression model of a fitted channel on n links, without effects.
 
-        Args:
-            links: n links.
-            channel: fitted channel.
-            dof: degrees of freedom of the Student-t errors.
-            device_m: (k, 3) positions of the devices [m], NaN without one; None: those of `links`.
-            train: (n,) bool, training links; None: all.
-            channel_db: (n,) mean level of the channel with declared powers and antennas [dB]; None:
-                it is predicted.
+        Devices may be at other positions (k, 3) [m], NaN without one. The training links (n,) are
+        all if None, and the mean level of the channel with declared powers and antennas (n,) [dB]
+        is predicted.
         """
         usable = np.ones(len(links), dtype=bool)
         if device_m is not None:
@@ -140,10 +135,7 @@ class Model:
             group=self.group[rows], terms=tuple(term.select(rows) for term in self.terms))
 
     def regression(self, rows: np.ndarray | slice = slice(None)) -> CensoredRegression:
-        """Build the regression of levels on some links; those not detected are censored.
-
-        `rows` is a mask, indices or a slice.
-        """
+        """Build the regression of levels on some links; those not detected are censored."""
         links, terms = self.links, self.terms
         n = len(self.channel_db[rows])
         return CensoredRegression(
@@ -304,12 +296,7 @@ class Fit(FitResult):
 
     def fit_shadowing(self, seed: int,
                       like: CorrelatedShadowing | None = None) -> CorrelatedShadowing:
-        """Fit `shadowing`, the interpolation of the training links' residuals over space.
-
-        Args:
-            seed: of random subsets of points.
-            like: shadowing whose correlation is used; None: it is fitted.
-        """
+        """Fit `shadowing` to the training links' residuals, with the correlation of `like`."""
         return CorrelatedShadowing.fit(self.links, self.train, self.training_z, seed, like)
 
     def predict(self, links: Links) -> Prediction:
@@ -323,10 +310,7 @@ class Fit(FitResult):
     def reading_parts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Split the prediction of all links into mean, error scale, and spread of unheard devices.
 
-        Returns:
-            (n,) mean [dB]; (n,) error scale without that spread [dB], the unit of interpolated
-            residuals; and (n,) standard deviation of the levels of devices that were never heard
-            [dB].
+        All are (n,) [dB]. The scale without that spread is the unit of interpolated residuals.
         """
         reading = self.readings()
         mean_db, total_db = reading.mean_db, reading.scale_db
@@ -347,11 +331,8 @@ def _root_sum_square(sds_db: list[np.ndarray | None], rows: np.ndarray | slice
 def response(effects: Sequence[tuple[Effect, Any]]) -> Response | None:
     """Chain the responses of effects, which change a level by a function of it; None: no effect.
 
-    Args:
-        effects: effects, each with the inputs (n, …) of its term.
-
-    Returns:
-        function from levels (n,) [dB] to changed levels (n,) [dB] and their slope (n,).
+    With each effect are the inputs (n, …) of its term. The function takes levels (n,) [dB] to
+    changed levels (n,) [dB] and their slope (n,).
     """
     if not effects:
         return None
@@ -394,12 +375,7 @@ class Unheard:
 
     @classmethod
     def of(cls, fit: Fit, device_sd_db: float) -> Unheard | None:
-        """Estimate mean and spread of the other devices' offsets; None: all have a training link.
-
-        Args:
-            fit: fit with effects.
-            device_sd_db: see the function of that name [dB].
-        """
+        """Estimate mean and spread of the other devices' offsets; None: all were heard."""
         links, device_db, declared = fit.links, np.zeros(len(fit.links)), set[int]()
         for number, (effect, term) in enumerate(zip(fit.effects, fit.model.terms, strict=True)):
             if effect.is_declared:
@@ -517,12 +493,9 @@ class FittedModel:
                           links.limit_db, self.dof)
 
     def reading_law_on(self, fit: Fit) -> ReadingLaw:
-        """Return the predictive distribution of a fit's links, with interpolated residuals.
+        """Return the predictive distribution of the links of this model's `on_links`.
 
-        Twins use it for maps, folds for held-out links.
-
-        Args:
-            fit: this model applied to n links, see `on_links`.
+        It has interpolated residuals. Twins use it for maps, folds for held-out links.
         """
         mean_db, scale_db, unheard_db = self._by_effects(fit)
         shift, remaining = shadowing = self._shadowing_at(fit.links)
@@ -534,11 +507,9 @@ class FittedModel:
                           fit.model.losses)
 
     def predictions_on(self, fit: Fit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the predictions of all models of the blend, for a fit's n links.
+        """Return levels and error scales (n, k) [dB] of the models of the blend, for a fit's links.
 
-        Returns:
-            (n, k) level [dB] and (n, k) error scale [dB] of each model, and (n,) standard deviation
-            of the levels of devices that were never heard [dB].
+        The third is the standard deviation (n,) of the levels of devices never heard [dB].
         """
         assert self.blend is not None
         mean_db, scale_db, unheard_db = self._by_effects(fit)

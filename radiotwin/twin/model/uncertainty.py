@@ -44,12 +44,7 @@ class ReadingDerivative:
     sides: tuple[float, float] = (1.0, 1.0)
 
     def moved(self, known: np.ndarray, wanted: np.ndarray) -> ReadingDerivative:
-        """Return the derivative for another subset of m links; 0 on links that this one lacks.
-
-        Args:
-            known: (m,) bool, the links of this derivative.
-            wanted: (m,) bool, the links of the returned derivative.
-        """
+        """Return the derivative from links `known` to `wanted` (m,) bool; 0 where it is unknown."""
         def on_wanted(values: np.ndarray) -> np.ndarray:
             on_all = np.zeros(len(known))
             on_all[known] = values
@@ -78,9 +73,7 @@ class Linearised:
 def linearise(fit: Fit, known: Mapping[int, list[ReadingDerivative]] | None = None) -> Linearised:
     """Linearise the readings of a model's training links in the parameters of its effects.
 
-    Args:
-        fit: fit with effects.
-        known: derivatives computed before, by index of the effect.
+    Derivatives known before are given by index of the effect.
     """
     variations = [effect.variation() for effect in fit.effects]
     fit = _with_varied_effects(fit, variations)
@@ -123,11 +116,7 @@ def estimates(linearised: Linearised) -> list[Estimate]:
 
 
 def _with_varied_effects(fit: Fit, variations: list[Variation | None]) -> Fit:
-    """Return the fit with every effect as its `variation` builds it, fitted again if that differs.
-
-    A variation mostly takes quick levels, from the channel's fast law, in place of exact ones, from
-    tracing paths.
-    """
+    """Return the fit with effects as their `variation` builds them, fitted again if they differ."""
     varied = [effect if variation is None else variation.effect(variation.values)
               for effect, variation in zip(fit.effects, variations, strict=True)]
     effects = [old if old.is_same(new) else new
@@ -139,10 +128,7 @@ def _with_varied_effects(fit: Fit, variations: list[Variation | None]) -> Fit:
 
 def _derivatives(fit: Fit, number: int, variation: Variation | None,
                  design_effect: float) -> list[ReadingDerivative]:
-    """Compute the derivative of the readings in each parameter of an effect, by apt steps.
-
-    A step is about as wide as the parameter's uncertainty, which a first step estimates.
-    """
+    """Compute the derivative of readings in each parameter, by steps as wide as its uncertainty."""
     if variation is None:
         return []
     found = []
@@ -227,8 +213,7 @@ def _curvatures(problem: CensoredRegression, predicted: Linearisation,
 def _scores(fit: Fit, derivatives: list[ReadingDerivative], design_effect: float) -> Scores:
     """Return each link's score (derivative of its log-likelihood), its information, and priors.
 
-    Columns are all coefficients, those of the channel first, then the varied parameters
-    (`derivatives`).
+    Columns are all coefficients, those of the channel first, then the varied parameters.
     """
     problem = fit.model.training
     predicted = problem.predict(fit)
