@@ -171,8 +171,7 @@ def print_report(report: BuildReport, console: Console) -> None:
         above = "" if report.altitudes_above == "datum" else f" above the {report.altitudes_above}"
         how = "" if report.altitudes_given else "   (from 10 m above 95 % of the roofs)"
         facts.add_row("lattice altitudes", f"{altitudes} m{above}{how}")
-        if report.step_m:
-            facts.add_row("lattice step", f"{report.step_m:g} m")
+        facts.add_row("lattice step", f"{report.step_m:g} m")
         facts.add_row("devices, UAVs", f"{report.devices}, {report.uavs}")
     facts.add_row("radio", f"{report.frequency_hz / 1e9:g} GHz" + "   (default: --frequency-hz or "
                   "--measurements)" * (report.frequency_hz == BuildOptions().frequency_hz)
@@ -183,33 +182,26 @@ def print_report(report: BuildReport, console: Console) -> None:
         facts.add_row(subject, escape(finding))
     print_table(facts, console)
     if report.materials:
-        print_table(_material_table(report), console)
-    console.print(_problem_table(report) if report.problems else "No problems found.")
-
-
-def _problem_table(report: BuildReport) -> Table:
-    """Return the table of a report's problems."""
-    table = Table(title="Problems", show_header=False, show_lines=True, **_TITLE)
-    table.add_column()
-    table.add_column(overflow="fold")
+        materials = Table(title=f"Materials at {report.frequency_hz / 1e9:g} GHz", **_TITLE)
+        materials.add_column("material", overflow="fold")
+        materials.add_column("kind", overflow="fold")
+        for heading in ("shapes", "relative permittivity", "conductivity [S/m]"):
+            materials.add_column(heading, justify="right", overflow="fold")
+        for use in report.materials:
+            materials.add_row(use.name, use.kind + ("" if use.in_range else " (out of range)"),
+                              f"{use.shapes:,}", f"{use.relative_permittivity:.3f}",
+                              f"{use.conductivity_s_per_m:.4g}")
+        print_table(materials, console)
+    if not report.problems:
+        console.print("No problems found.")
+        return
+    problems = Table(title="Problems", show_header=False, show_lines=True, **_TITLE)
+    problems.add_column()
+    problems.add_column(overflow="fold")
     for problem in report.problems:
-        table.add_row(Text(problem.severity, style=_COLOURS[problem.severity]),
-                      Text(problem.message))
-    return table
-
-
-def _material_table(report: BuildReport) -> Table:
-    """Return the table of a report's materials."""
-    table = Table(title=f"Materials at {report.frequency_hz / 1e9:g} GHz", **_TITLE)
-    table.add_column("material", overflow="fold")
-    table.add_column("kind", overflow="fold")
-    for heading in ("shapes", "relative permittivity", "conductivity [S/m]"):
-        table.add_column(heading, justify="right", overflow="fold")
-    for use in report.materials:
-        table.add_row(use.name, use.kind + ("" if use.in_range else " (out of range)"),
-                      f"{use.shapes:,}", f"{use.relative_permittivity:.3f}",
-                      f"{use.conductivity_s_per_m:.4g}")
-    return table
+        problems.add_row(Text(problem.severity, style=_COLOURS[problem.severity]),
+                         Text(problem.message))
+    console.print(problems)
 
 
 @dataclass(frozen=True)

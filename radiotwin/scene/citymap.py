@@ -362,9 +362,7 @@ class CityMap:
                    ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """Yield where segments (a, b) first cross a surface, then where they next do, and so on.
 
-        Yields:
-            Of the segments that cross once more: distance from a [m], +1 for entering or -1 for
-            leaving a solid, and index.
+        Of those that do: distance from a [m], +1 (entering) or -1 (leaving a solid), and index.
         """
         ray = np.arange(len(a_m))
         length = np.linalg.norm(b_m - a_m, axis=1)

@@ -159,14 +159,7 @@ def _safe_names(wanted_names: Sequence[str]) -> tuple[list[str], list[Problem]]:
 
 @dataclass
 class _Loaded:
-    """Shapes of a file that were read.
-
-    Attributes:
-        inside: Indices of the shapes that reach into the box, or could not be read.
-        meshes: Index -> vertices [m] and faces, of the shapes inside with faces.
-        bounds: (2,) lowest and highest x and y of all shapes [m]; None: nothing was read.
-        problems: Problems of the shapes inside.
-    """
+    """Shapes that reach into the box or cannot be read, their meshes by index, all bounds [m]."""
 
     inside: list[int] = field(default_factory=list)
     meshes: dict[int, Mesh] = field(default_factory=dict)

@@ -5,7 +5,7 @@ Also names of shapes and materials that Sionna RT, Mitsuba and file systems acce
 
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -238,12 +238,46 @@ def map_materials(shapes: Sequence[DeclaredShape], declared: Mapping[str, Node],
     Raises:
         BadInput: An override names a material that the city does not use, or no ITU material.
     """
-    mapper = _Mapper(declared, overrides)
-    materials = [mapper.material_of(shape) for shape in shapes]
-    unused = set(overrides) - mapper.overridden
+    known: dict[str, Material | None] = {}
+    used: set[str] = set()
+    found: list[Problem] = []
+    older: list[str] = []
+    materials = []
+    for shape in shapes:
+        if shape.material is None:
+            materials.append(None)
+            continue
+        if isinstance(shape.material, Node):
+            node: Node | None = shape.material
+            identifier = shape.material.attributes.get("id") or f"{shape.name}-material"
+        else:
+            identifier, node = shape.material, declared.get(shape.material)
+        if identifier not in known:
+            names = identifier, identifier.removeprefix("mat-")
+            key = next((name for name in names if name in overrides), None)
+            try:
+                if key is not None:
+                    used.add(key)
+                    known[identifier] = itu_material(overrides[key])
+                else:
+                    known[identifier], is_older = _declared_material(identifier, node)
+                    older += [identifier] * is_older
+            except _Unmapped as error:
+                known[identifier] = None
+                found.append(problems.error(str(error), identifier))
+        materials.append(known[identifier])
+    unused = set(overrides) - used
     if unused and must_use_all:
-        raise _unused_override_error(unused, mapper.known)
-    return materials, mapper.all_problems()
+        raise _unused_override_error(unused, known)
+    if older:
+        found.append(problems.fixed(
+            f"{len(older)} material(s) in the older form, a surface colour with an ITU name "
+            f"({listed(older)}): written as ITU radio materials"))
+    if bare := [shape.name for shape in shapes if shape.material is None]:
+        found.append(problems.error(
+            f"{len(bare)} shape(s) have no material ({listed(bare)}); add "
+            '<ref id="mat-itu_concrete" name="bsdf"/> and that material'))
+    return materials, found
 
 
 def _unused_override_error(names: Collection[str], known: Iterable[str]) -> BadInput:
@@ -298,90 +332,36 @@ class _Unmapped(Exception):
     """A declared material that has no radio constants; the message says what to do."""
 
 
-@dataclass
-class _Mapper:
-    """Finds the materials of shapes one by one, and collects the problems."""
+def _declared_material(identifier: str, node: Node | None) -> tuple[Material, bool]:
+    """Return the material of a `<bsdf>` by its ITU name or constants, and if its form is older.
 
-    declared: Mapping[str, Node]
-    overrides: Mapping[str, str]
-    known: dict[str, Material | None] = field(default_factory=dict)
-    overridden: set[str] = field(default_factory=set)
-    problems: list[Problem] = field(default_factory=list)
-    legacy: list[str] = field(default_factory=list)
-    bare: list[str] = field(default_factory=list)
-
-    def material_of(self, shape: DeclaredShape) -> Material | None:
-        """Return the material of a shape, or None and note the problem.
-
-        Problems are shapes that name no material, or one without radio constants.
-        """
-        if shape.material is None:
-            self.bare.append(shape.name)
-            return None
-        node: Node | None
-        if isinstance(shape.material, Node):
-            node = shape.material
-            identifier = node.attributes.get("id") or f"{shape.name}-material"
-        else:
-            identifier = shape.material
-            node = self.declared.get(identifier)
-        if identifier not in self.known:
-            try:
-                self.known[identifier] = self._resolve(identifier, node)
-            except _Unmapped as error:
-                self.known[identifier] = None
-                self.problems.append(problems.error(str(error), identifier))
-        return self.known[identifier]
-
-    def all_problems(self) -> list[Problem]:
-        """Return the problems of all shapes so far; shapes without a material are one problem."""
-        found = list(self.problems)
-        if self.legacy:
-            found.append(problems.fixed(
-                f"{len(self.legacy)} material(s) in the older form, a surface colour with an ITU "
-                f"name ({listed(self.legacy)}): written as ITU radio materials"))
-        if self.bare:
-            found.append(problems.error(
-                f"{len(self.bare)} shape(s) have no material ({listed(self.bare)}); add "
-                '<ref id="mat-itu_concrete" name="bsdf"/> and that material'))
-        return found
-
-    def _resolve(self, identifier: str, node: Node | None) -> Material:
-        """Find the radio material of a `<bsdf>` by an override, its ITU name, or its constants.
-
-        _Unmapped, with a remedy, if it has none of these, or is not declared (`node` is None).
-        """
-        base = identifier.removeprefix("mat-")
-        for key in (identifier, base):
-            if key in self.overrides:
-                self.overridden.add(key)
-                return itu_material(self.overrides[key])
-        remedy = f"say what it is made of, for example with --material {base}=itu_concrete"
-        if node is None:
-            raise _Unmapped(f"material {identifier!r} is used but not declared; {remedy}")
-        kind = node.attributes.get("type", "")
-        has_itu_name = base.startswith(("itu_", "itu-"))
-        if has_itu_name or kind == "itu-radio-material":
-            itu = itu_name(node.get("string", "type") or (base if has_itu_name else ""))
-            if itu is None:
-                raise _Unmapped(f"{node.position}: material {identifier!r} has the ITU type "
-                                f"{node.get('string', 'type') or base!r}, which does not exist; "
-                                f"there are: {', '.join(ITU_TABLE)}")
-            if kind != "itu-radio-material":
-                self.legacy.append(identifier)
-            name = safe_name(base[4:] if has_itu_name else base)
-            return _with_surface(identifier, node, Material(name, itu=itu))
-        if kind == "radio-material":
-            name = safe_name(base)
-            return _with_surface(identifier, node, Material(
-                f"own-{name}" if itu_name(name) else name,
-                relative_permittivity=node.number("relative_permittivity", 1.0),
-                conductivity_s_per_m=node.number("conductivity", 0.0)))
-        if base in ITU_TABLE:
-            self.legacy.append(identifier)
-            return itu_material(base)
-        raise _Unmapped(f"{node.position}: material {identifier!r} (type '{kind}') has no radio "
-                        f"constants; {remedy}")
+    _Unmapped, with a remedy, if it has neither, or is not declared (`node` is None).
+    """
+    base = identifier.removeprefix("mat-")
+    remedy = f"say what it is made of, for example with --material {base}=itu_concrete"
+    if node is None:
+        raise _Unmapped(f"material {identifier!r} is used but not declared; {remedy}")
+    kind = node.attributes.get("type", "")
+    has_itu_name = base.startswith(("itu_", "itu-"))
+    if has_itu_name or kind == "itu-radio-material":
+        itu = itu_name(node.get("string", "type") or (base if has_itu_name else ""))
+        if itu is None:
+            raise _Unmapped(f"{node.position}: material {identifier!r} has the ITU type "
+                            f"{node.get('string', 'type') or base!r}, which does not exist; "
+                            f"there are: {', '.join(ITU_TABLE)}")
+        name = safe_name(base[4:] if has_itu_name else base)
+        return (_with_surface(identifier, node, Material(name, itu=itu)),
+                kind != "itu-radio-material")
+    if kind == "radio-material":
+        name = safe_name(base)
+        return _with_surface(identifier, node, Material(
+            f"own-{name}" if itu_name(name) else name,
+            relative_permittivity=node.number("relative_permittivity", 1.0),
+            conductivity_s_per_m=node.number("conductivity", 0.0))), False
+    if base in ITU_TABLE:
+        return itu_material(base), True
+    raise _Unmapped(f"{node.position}: material {identifier!r} (type '{kind}') has no radio "
+                    f"constants; {remedy}")
 
 
 def _with_surface(identifier: str, node: Node, material: Material) -> Material:

@@ -93,46 +93,6 @@ class Node:
             waiting += reversed(node.children)
 
 
-class XmlReader:
-    """Parses XML files into trees, within one budget of bytes and elements for all files.
-
-    Messages about the budget name `path`, the first file.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._bytes = self._elements = self._files = 0
-
-    def read(self, path: Path) -> Node:
-        """Parse one file and return its root element.
-
-        Raises:
-            BadInput: No such file, malformed XML (with line and column), declared entities, too
-                large, or nested too deep.
-        """
-        self._files += 1
-        FILES.check(self._files, self._path)
-        top = Node("", {}, path, 0)
-        open_nodes = [top]
-        max_elements, max_depth = ELEMENTS.limit, NESTING.limit  # looked up once
-
-        def start(tag: str, attributes: dict[str, str], line: int) -> None:
-            self._elements += 1
-            node = Node(tag, attributes, path, line)
-            if self._elements > max_elements or len(open_nodes) > max_depth:
-                ELEMENTS.check(self._elements, self._path)
-                NESTING.check(len(open_nodes), node.position)
-            open_nodes[-1].children.append(node)
-            open_nodes.append(node)
-
-        def end(tag: str) -> None:
-            open_nodes.pop()
-
-        self._bytes += parse_elements(path, start, end, DOCUMENT_BYTES)
-        DOCUMENT_BYTES.check(self._bytes, f"{self._path} with the files that it includes")
-        return top.children[0]
-
-
 def read_numbers(node: Node, text: str, counts: tuple[int, ...]) -> np.ndarray:
     """Parse finite numbers separated by blanks or commas.
 
@@ -276,18 +236,40 @@ class _Reader:
         self.lengths: list[int] = []  # of the parameters' names, the longest first
         self.substituted = 0  # characters that parameters were replaced by
         self.folders = [path.parent]
-        self.xml = XmlReader(path)
+        self.path = path
+        self.bytes = self.elements = self.files = 0  # of all files, which share one budget
         self._read_file(path, ())
 
     def _read_file(self, path: Path, above: tuple[Path, ...]) -> None:
         """Read a scene file; `above` are the files that include it, from the outermost."""
-        root = self.xml.read(path)
+        root = self._parse(path)
         if root.tag != "scene":
             raise BadInput(f"{root.position}: the file begins with <{root.tag[:60]}>, not <scene>; "
                            "give a Mitsuba or Sionna RT scene file")
         if self.scene_folder:
             _check_city(root)
         self._read_children(root, (*above, path.resolve()))
+
+    def _parse(self, path: Path) -> Node:
+        """Parse one file and return its root element."""
+        self.files += 1
+        FILES.check(self.files, self.path)
+        top = Node("", {}, path, 0)
+        open_nodes = [top]
+        max_elements, max_depth = ELEMENTS.limit, NESTING.limit  # looked up once
+
+        def start(tag: str, attributes: dict[str, str], line: int) -> None:
+            self.elements += 1
+            node = Node(tag, attributes, path, line)
+            if self.elements > max_elements or len(open_nodes) > max_depth:
+                ELEMENTS.check(self.elements, self.path)
+                NESTING.check(len(open_nodes), node.position)
+            open_nodes[-1].children.append(node)
+            open_nodes.append(node)
+
+        self.bytes += parse_elements(path, start, lambda tag: open_nodes.pop(), DOCUMENT_BYTES)
+        DOCUMENT_BYTES.check(self.bytes, f"{self.path} with the files that it includes")
+        return top.children[0]
 
     def _read_children(self, parent: Node, files: tuple[Path, ...]) -> None:
         """Read the materials, shapes, includes and parameters of a `<scene>` and its `merge`.

@@ -271,11 +271,7 @@ def _read_uniform(data: bytes, start: int, order: str, element: _Element
 
 def _read_ragged(path: Path, data: bytes, at: int, order: str, element: _Element
                  ) -> tuple[dict, int]:
-    """Read the binary rows of an element one by one, as their lists differ in length.
-
-    Returns:
-        values of each property that is needed, and the position where the rows end.
-    """
+    """Read rows whose lists differ in length one by one; returns the same as `_read_uniform`."""
     found = _containers(element)
     for row in range(element.count):
         try:

@@ -194,11 +194,7 @@ def count_meetings(sides: np.ndarray, at_once: int, check: Callable[[int], None]
 
 def _cut_to_height(a_m: np.ndarray, b_m: np.ndarray,
                    height_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cut straight links (a, b) to their parts between z = 0 and a height [m].
-
-    Returns:
-        (m,) rows of the links that have such a part, and (m, 3) both ends of it [m].
-    """
+    """Return rows (m,) and ends (m, 3) of the parts of links (a, b) from z = 0 to a height [m]."""
     rise_m = b_m[:, 2] - a_m[:, 2]
     flat = np.abs(rise_m) < 1e-9
     slope = np.where(flat, 1.0, rise_m)

@@ -67,9 +67,9 @@ from radiotwin.scene.readers.solids import (
     Prism,
     elevation_fact,
     find_contacts,
-    find_overlaps,
     make_prisms,
     make_shell_prisms,
+    overlap_problems,
 )
 from radiotwin.scene.readers.systems import check_declared_system
 from radiotwin.scene.readers.terrain import Ground, make_ground, raise_to_terrain
@@ -100,14 +100,8 @@ def _building_table(prisms: Sequence[Prism], shape_of: Mapping[int, str],
                    on_terrain: bool = False) -> pd.DataFrame:
     """Return the table of buildings, one row per prism (a building, or a part with its own height).
 
-    Columns are building, shape, x_m, y_m (a point inside), area_m2, on terrain ground_m (the lowest
-    ground under the building), bottom_m and top_m (above the datum), height_from, height_sd_m (see
-    `height_sds_m`), unusable (tags that were skipped), material and material_from.
-
-    Args:
-        prisms: prisms of all buildings.
-        shape_of: index of a prism -> name of its shape.
-        on_terrain: whether the ground is a terrain.
+    x_m and y_m are a point inside, ground_m is the lowest ground under the building; bottom_m and
+    top_m are above the datum. `shape_of` maps the index of a prism to the name of its shape.
     """
     rows, heights_sd_m = [], height_sds_m(
         np.array([prism.height.top_m - prism.ground_m for prism in prisms]),
@@ -140,22 +134,15 @@ def check_map_options(options: BuildOptions) -> None:
         raise BadInput(f"--terrain-unit {options.terrain_unit!r} is not possible; give m or ft")
     if options.terrain_unit is not None and options.terrain is None:
         raise BadInput("--terrain-unit is that of a terrain; give one with --terrain FILE.tif")
+    if options.ground_column is not None and options.height_column is None:
+        raise BadInput("--ground-column is subtracted from the column of roofs; name that with "
+                       "--height-column, too")
     if options.bbox is not None:
         south, west, north, east = options.bbox
         if not (-90 <= south < north <= 90 and -180 <= west < east <= 180):
             raise BadInput(f"bbox {options.bbox} is not possible; give SOUTH,WEST,NORTH,EAST in "
                            "degrees, the south below the north and the west below the east")
     options.check()
-
-
-def _declared_column(options: BuildOptions) -> HeightColumn | None:
-    """Return the column of heights that the user named, with that of the ground; else None."""
-    if options.height_column is not None:
-        return declared_column(options.height_column, options.ground_column)
-    if options.ground_column is not None:
-        raise BadInput("--ground-column is subtracted from the column of roofs; name that with "
-                       "--height-column, too")
-    return None
 
 
 def map_suffix(source: Path | str) -> str | None:
@@ -194,7 +181,8 @@ def build_scene_from_map(
     path, out_folder = Path(source), Path(out_folder)
     options = options or BuildOptions()
     check_map_options(options)
-    height_column = _declared_column(options)
+    height_column = None if options.height_column is None else declared_column(
+        options.height_column, options.ground_column)
     materials = with_materials(options.material_table, options.materials or {})
     default_m = options.default_height_m or DEFAULT_HEIGHT_M
     if not check_only:
@@ -251,7 +239,7 @@ def build_scene_from_map(
         origin = origin.model_copy(update={"altitude_m": ground.config.datum_m})
         prisms = raise_to_terrain(prisms, ground)
     contacts = find_contacts(prisms)
-    problems += [*_overlap_problems(prisms, contacts), *ground.problems]
+    problems += [*overlap_problems(prisms, contacts), *ground.problems]
     city, shape_of = _assemble_city(prisms, contacts, ground, materials, problems)
     table = _building_table(prisms, shape_of, ground.config is not None)
     counts = Counter(table.drop_duplicates(["building", "height_from"])["height_from"])
@@ -295,8 +283,7 @@ def _default_height_problems(prisms: list[Prism], features: list[Feature],
                              default_height_m: float | None, path: Path) -> list[Problem]:
     """Return a warning if buildings have the default height, and the user did not choose it.
 
-    Raises:
-        BadInput: all buildings of a table have it, though one of its columns may hold heights.
+    BadInput if all of a table have it, though one of its columns may hold heights.
     """
     buildings = {prism.name for prism in prisms}
     guessed = {prism.name for prism in prisms if prism.height.source == "default"}
@@ -324,11 +311,7 @@ def _check_unit(prisms: list[Prism], plan_m: float, declared: HeightColumn | Non
 
 
 def _features_in_box(features: list[Feature], bbox_deg: Bounds | None, path: Path) -> list[Feature]:
-    """Return the buildings that reach into the box (None: all); of 3D models, with all parts.
-
-    Raises:
-        BadInput: coordinates that are no degrees, too intricate outlines, or none in the box.
-    """
+    """Return the buildings that reach into the box (None: all); of 3D models, with all parts."""
     bounds_deg = np.array([feature.area.bounds for feature in features])  # empty area: NaN
     for feature, bounds in zip(features, bounds_deg):
         if (np.abs(bounds) > (180, 90, 180, 90)).any():
@@ -418,13 +401,6 @@ def _check_width(width_m: float, max_m: float) -> None:
     if not width_m <= max_m:  # also for NaN
         raise BadInput(f"the area is {width_m / 1000:.0f} km wide, {MAX_WIDTH_M / 1000:g} km are "
                        "allowed; choose a part with --bbox SOUTH,WEST,NORTH,EAST")
-
-
-def _overlap_problems(prisms: list[Prism], contacts: Contacts) -> list[Problem]:
-    """Return a warning about buildings that overlap, the largest overlap first."""
-    overlaps = sorted(find_overlaps(prisms, contacts), key=lambda overlap: -overlap[2])
-    names = [f"{a.name} and {b.name}: {shared_m2:.0f} m²" for a, b, shared_m2 in overlaps]
-    return problems_of(names, "pair(s) of buildings overlap: their common part is built once")
 
 
 def _ground_box(prisms: list[Prism], extent_m: Bounds) -> Bounds:

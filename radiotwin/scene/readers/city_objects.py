@@ -196,10 +196,7 @@ def _features(chosen: list[tuple[CityObject, str, list[Geometry]]], points: list
               by_name: Mapping[str, CityObject]) -> list[Feature]:
     """Return a feature for each chosen geometry, an outline or a shell of surfaces, with tags.
 
-    Args:
-        chosen: objects, names of their buildings, and their geometries.
-        points: corners of all these geometries, (n, 3) longitude, latitude [degrees], height [m].
-        by_name: name -> object.
+    `points` are the corners (n, 3) of each: longitude, latitude [degrees], height [m].
     """
     ground_m: dict[str, float] = {}
     corners = iter(points)

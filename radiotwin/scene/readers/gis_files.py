@@ -421,11 +421,9 @@ def read_geoparquet(path: Path, crs: str | None = None) -> MapFile:
 
 
 def _schema(path: Path) -> tuple[list[str], list[str], str, dict | str | None]:
-    """Read the metadata of a GeoParquet file.
+    """Return the names of a GeoParquet file's plain, nested and geometry columns, and its system.
 
-    Returns:
-        Names of plain columns, of nested columns, of the geometry column, and its coordinate
-        reference system (PROJ's JSON or a name; "": unknown; None: longitude and latitude).
+    That is in PROJ's JSON, or a name; "": unknown; None: longitude and latitude.
     """
     require_pyarrow(path)
     from pyarrow import ArrowException, types

@@ -99,7 +99,10 @@ def make_prisms(
         The prisms, and problems of the features.
     """
     defects = _Defects()
-    areas = _clean_areas(features, origin, defects)
+    areas_m = shapely.transform([feature.area for feature in features],
+                                lambda points: np.column_stack(to_local(origin, *points.T)))
+    areas = [(feature, kept) for feature, area_m in zip(features, areas_m)
+             if (kept := _clean_area(feature, area_m, defects)) is not None]
     buildings = [(feature, area) for feature, area in areas if not feature.is_part]
     parts = [(feature, area) for feature, area in areas if feature.is_part]
     prisms = []
@@ -175,14 +178,6 @@ class _Defects:
                 for problem in problems_of(self.names.get(kind, ()), text, severity)]
 
 
-def _clean_areas(features: Sequence[Feature], origin: Origin, defects: _Defects) -> list[Area]:
-    """Return features with repaired areas in the local frame [m]; empty ones go to `defects`."""
-    areas = shapely.transform([feature.area for feature in features],
-                              lambda points: np.column_stack(to_local(origin, *points.T)))
-    return [(feature, kept) for feature, area in zip(features, areas)
-            if (kept := _clean_area(feature, area, defects)) is not None]
-
-
 def _clean_area(feature: Feature, area: BaseGeometry,
                 defects: _Defects) -> shapely.MultiPolygon | None:
     """Return a feature's polygons [m], repaired, rounded, without slivers; None if none is left."""
@@ -239,10 +234,8 @@ def _resolve_parts(
 ) -> list[tuple[Feature, shapely.MultiPolygon, Area]]:
     """Assign parts to buildings: parts inherit tags, buildings lose the areas of their parts.
 
-    Returns:
-        Parts, then buildings: feature, area, and the building with its full area. The building of a
-        part is the smallest one around it; the part itself if there is none. Buildings that their
-        parts cover to `MIN_COVERED_SHARE` are left out.
+    Returned are parts, then buildings: feature, area, and the building with its full area. That of
+    a part is the smallest one around it, or the part itself. Covered buildings are left out.
     """
     tree, found = shapely.STRtree([area for _, area in buildings]), 0
     building_m2 = [area.area for _, area in buildings]
@@ -336,17 +329,16 @@ def _touching_pairs(prisms: Sequence[Prism], areas: Any) -> np.ndarray:
     return np.concatenate(parts)
 
 
-def find_overlaps(prisms: Sequence[Prism],
-                  contacts: Contacts) -> list[tuple[Prism, Prism, float]]:
-    """Return pairs of prisms of different buildings that overlap by over 1 m², and by how much."""
+def overlap_problems(prisms: Sequence[Prism], contacts: Contacts) -> list[Problem]:
+    """Return a warning about buildings that overlap by over 1 m², the largest overlap first."""
     found = []
-    for (a, b), shared_m2 in zip(contacts.pairs.tolist(), contacts.shared_m2.tolist()):
-        first, second = prisms[a], prisms[b]
-        if (shared_m2 > MIN_OVERLAP_M2 and first.name != second.name
-                and min(first.height.top_m, second.height.top_m)
-                > max(first.height.bottom_m, second.height.bottom_m)):
-            found.append((first, second, shared_m2))
-    return found
+    for row in np.argsort(-contacts.shared_m2, kind="stable"):
+        a, b = (prisms[index] for index in contacts.pairs[row])
+        shared_m2 = contacts.shared_m2[row]
+        if (shared_m2 > MIN_OVERLAP_M2 and a.name != b.name and min(a.height.top_m, b.height.top_m)
+                > max(a.height.bottom_m, b.height.bottom_m)):
+            found.append(f"{a.name} and {b.name}: {shared_m2:.0f} m²")
+    return problems_of(found, "pair(s) of buildings overlap: their common part is built once")
 
 
 def make_shell_prisms(features: Sequence[Feature], origin: Origin, table: MaterialTable
@@ -387,16 +379,12 @@ def make_shell_prisms(features: Sequence[Feature], origin: Origin, table: Materi
         height = Height(float(bottom_m), float(top_m), "model")
         prisms.append(Prism(feature.name, area, height, *table.material_of(feature.tags),
                             model_surfaces))
-    return _with_building_footprints(prisms), defects.problems()
-
-
-def _with_building_footprints(prisms: Sequence[Prism]) -> list[Prism]:
-    """Return the prisms with the footprint of their whole building: the union by name."""
-    areas: dict[str, list[BaseGeometry]] = {}
+    areas: dict[str, list[BaseGeometry]] = {}  # by building
     for prism in prisms:
         areas.setdefault(prism.name, []).append(prism.area)
     footprints = {name: shapely.union_all(parts) for name, parts in areas.items()}
-    return [replace(prism, building_footprint=footprints[prism.name]) for prism in prisms]
+    return ([replace(prism, building_footprint=footprints[prism.name]) for prism in prisms],
+            defects.problems())
 
 
 def elevation_fact(features: Sequence[Feature]) -> str:
@@ -407,14 +395,9 @@ def elevation_fact(features: Sequence[Feature]) -> str:
 
 
 def _triangulate(shell: Shell, points_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Cut the polygons of a shell into triangles.
+    """Cut the polygons of a shell, points (n, 3) in the local frame [m], into triangles.
 
-    Args:
-        shell: surfaces of a building.
-        points_m: (n, 3) its points in the local frame [m].
-
-    Returns:
-        (v, 3) corners, with heights above the building's ground [m], and (f, 3) faces.
+    Returned are corners (v, 3) with heights above the building's ground [m], and faces (f, 3).
     """
     vertices = np.round(points_m - [0, 0, shell.ground_m], _DECIMALS)
     vertices, same = np.unique(vertices, axis=0, return_inverse=True)

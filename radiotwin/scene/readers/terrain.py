@@ -153,10 +153,7 @@ def _upward(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 def _errors(mesh: Delaunay, node: np.ndarray, z_m: np.ndarray,
             chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the triangle that each node (n,) lies in, and its vertical distance from that [m].
-
-    Nodes `chosen` (indices) are the corners of the triangles: their distance is 0.
-    """
+    """Return the triangle that each node (n,) lies in, and its vertical distance from that [m]."""
     triangle = mesh.find_simplex(node)
     affine = mesh.transform[triangle]
     share = np.einsum("nij,nj->ni", affine[:, :2], node - affine[:, 2])
@@ -337,9 +334,7 @@ def _nodes(file: Any, system: "CRS", origin: Origin,
            box_m: Bounds) -> tuple[np.ndarray, np.ndarray, int, float]:
     """Choose the nodes of the grid over a box: as dense as pixels, at most `MAX_NODES`.
 
-    Returns:
-        x (nx,) and y (ny,) of the nodes [m], the number of pixels per node along each axis, and the
-        side of a pixel [m].
+    Returned are their x (nx,) and y (ny,) [m], the pixels per node, and the side of a pixel [m].
     """
     from pyproj import Transformer
 
@@ -364,19 +359,10 @@ def _nodes(file: Any, system: "CRS", origin: Origin,
 
 def _window(path: Path, file: Any, column: np.ndarray, row: np.ndarray, every: int,
             pixel: float) -> tuple[np.ndarray, tuple[int, int], int]:
-    """Read the part of a raster around some pixels, averaged over squares of pixels.
+    """Read the part of a raster around some pixels, averaged over squares of `every` pixels a side.
 
-    Args:
-        path: file, for messages.
-        file: raster, opened.
-        column: columns of the pixels to read.
-        row: rows of these pixels.
-        every: side of a square, in pixels.
-        pixel: side of a pixel, in the unit of heights.
-
-    Returns:
-        Mean heights of the squares (NaN without data), row and column of the first pixel, and the
-        number of zeros that were taken for no data.
+    `pixel` is the side of a pixel, in the unit of heights. Returned are mean heights (NaN without
+    data), row and column of the first pixel, and the number of zeros that were taken for no data.
     """
     finite = np.isfinite(column) & np.isfinite(row)
     bounds = []
