@@ -33,13 +33,14 @@ from marl.worlds import twin_prior
 from radiotwin import Scene, Twin, fit_twin, fly_survey
 from radiotwin.maps.survey import read_truth
 from studies import tables
-from studies.disturbances import OFF_M, SILENT_DB
 from studies.runner import Study
 
 BATTERY = {"rbm-traced": 0.9, "rbm-segmented": 1.0, "rdm-traced": 0.95, "rdm-segmented": 1.0,
            "runs/town-traced": 0.75, "runs/town-segmented": 0.82,
            "runs/munich-traced": 1.0, "runs/munich-segmented": 1.1}
 OF_SILENT = 0.85  # of the battery, where there is less to collect
+OFF_M = (20.0, 40.0)  # of a device from where it is thought to be
+SILENT_DB = -1000.0  # SNR between UAVs without a link
 SCENARIOS = ("positions", "silent", "both", "volumes")
 SILENT, SILENT_SHARE = 3, 0.3
 PROMISED, WANTED, UAVS = 2, 0.9, range(1, 7)  # seeds with a promise; share and numbers of a sizing

@@ -21,16 +21,10 @@ from radiotwin.io.files import atomic_path
 from radiotwin.runtime.execution import Job, open_executor
 
 SCHEMA, RECORDS = "radiotwin.study/1", Path(__file__).parents[1] / "docs" / "results"
-MODULES = {"models": "models", "curve": "learning", "federation": "learning", "tuning": "learning",
-           "twin": "twins", "quality": "twins", "pays": "disturbances",
-           "hidden": "closeloop",
-           "real": "closeloop_real", "injected": "injected", "tracer": "tracer",
-           "speed": "speed", "flower": "flower", "engine": "engine", "accuracy": "tracer",
-           "campus": "campus", "readings": "campus_learning",
-           "away": "campus_learning", "terms": "campus_terms",
-           "maps": "wrong_maps", "foreign": "foreign", "calibration": "calibration",
-           "sizes": "told_sizes", "belief": "belief",
-           "reciprocity": "reciprocity", "where": "where"}
+MODULES = {"models": "models", "curve": "learning", "belief": "belief", "foreign": "foreign",
+           "where": "where", "hidden": "closeloop", "calibration": "calibration",
+           "real": "closeloop_real", "injected": "injected", "campus": "campus",
+           "away": "campus_learning", "readings": "campus_learning", "speed": "speed"}
 """Name of a study -> its module in this package."""
 Run = Callable[[int, dict], dict]
 Todo = list[tuple[str, int, dict]]

@@ -72,14 +72,6 @@ def with_sd(values: Sequence[float] | np.ndarray, digits: int = 3) -> str:
     return f"{mean} ± {sd(values):.{digits}f}" if len(values) > 1 else mean
 
 
-def quantiles(errors_m: list[float | None]) -> tuple[float, float, float, float]:
-    """Return median, 90 % quantile and maximum [m], and the share above 100 m; None is far away."""
-    errors = np.array([np.inf if error is None else error for error in errors_m])
-    most = pd.Series(errors).quantile(  # nothing lies between a number and infinity
-        0.9, interpolation="linear" if np.isfinite(errors).all() else "higher")
-    return float(np.median(errors)), most, float(errors.max()), float(np.mean(errors > 100))
-
-
 class Curve(NamedTuple):
     """Mean and standard deviation over seeds at `(n,)` real episodes, or over another abscissa."""
 
@@ -93,25 +85,26 @@ class Curve(NamedTuple):
         return float(self.x[enough[0]]) if len(enough) else np.nan
 
 
-def over_seeds(curves: pd.Series, x: str = "real_episodes", y: str = "truth_ratio") -> Curve:
+def over_seeds(curves: pd.Series) -> Curve:
     """Return the curve of a row's seeds, as long as the shortest."""
-    length = min(len(curve[x]) for curve in curves)
-    xs, ys = (np.array([curve[key][:length] for curve in curves], dtype=float) for key in (x, y))
+    length = min(len(curve["real_episodes"]) for curve in curves)
+    xs, ys = (np.array([curve[key][:length] for curve in curves], dtype=float)
+              for key in ("real_episodes", "truth_ratio"))
     return Curve(xs.mean(axis=0), ys.mean(axis=0), sd(ys))
 
 
-def last(curves: pd.Series, column: str = "truth_ratio") -> list[float]:
-    """Return the last value of each curve."""
-    return [curve[column][-1] for curve in curves]
+def last(curves: pd.Series) -> list[float]:
+    """Return the last share of each curve."""
+    return [curve["truth_ratio"][-1] for curve in curves]
 
 
-def worlds(rows: pd.DataFrame) -> Iterator[tuple[str, str, dict[str, pd.DataFrame]]]:
-    """Yield title, scene, and its rows by name without the world; ray-traced truths first."""
+def worlds(rows: pd.DataFrame) -> Iterator[tuple[str, dict[str, pd.DataFrame]]]:
+    """Yield title of a world, and its rows by name without the world; ray-traced truths first."""
     truth = rows["settings"].str["truth"]
     scene = rows["settings"].str["scene"].str.split("/").str[-1]
     for (_, of, where), group in rows.groupby([truth != "traced", truth, scene]):
         kind = "ray-traced" if of == "traced" else "statistical"
-        yield f"{where.replace('paper_', 'the paper’s ')}, {kind} truth", where, {
+        yield f"{where.replace('paper_', 'the paper’s ')}, {kind} truth", {
             name.removeprefix(f"{where}-").removeprefix(f"{of}-"): seeds
             for name, seeds in group.groupby("name")}
 
@@ -136,20 +129,6 @@ def draw_line(axes: Axes, curve: Curve, label: str, index: int) -> None:
     axes.fill_between(curve.x, curve.mean - curve.sd, curve.mean + curve.sd, color=colour,
                       alpha=0.18, linewidth=0)
     axes.grid(True, alpha=0.3)
-
-
-def draw_bars(axes: Axes, groups: dict[str, list], errors: dict[str, list], labels: Sequence[str],
-              **texts: str) -> None:
-    """Draw means of a group of values for each label, side by side, with error bars."""
-    width = 0.8 / len(groups)
-    for index, (name, cells) in enumerate(groups.items()):
-        axes.bar(np.arange(len(cells)) + (index - (len(groups) - 1) / 2) * width,
-                 [np.mean(cell) if len(cell) else np.nan for cell in cells], width * 0.92,
-                 yerr=errors[name], color=COLOURS[index % len(COLOURS)],
-                 error_kw={"linewidth": 1}, label=name)
-    axes.set(xticks=range(len(labels)), ylim=(0, 1.02), ylabel=RATIO, **texts)
-    axes.set_xticklabels(labels)
-    axes.grid(alpha=0.3, axis="y")
 
 
 def with_legend(figure: Figure, panels: list[Axes], columns: int) -> Figure:

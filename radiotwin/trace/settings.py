@@ -1,7 +1,6 @@
 """Settings of the ray tracer.
 
-Cost and accuracy of the qualities, measured with
-`python -m studies tracer` (1000 links in a dense city, 880 of them
+Cost and accuracy of the qualities (docs/results/tracer.md: 1000 links in a dense city, 880 of them
 detected; two cores; differences from a reference with a million samples):
 
 | quality | links/s | memory  | 9 of 10 links within | RMS    |

@@ -28,7 +28,7 @@ from marl.fedqmix.session import federate, node_config  # noqa: E402
 from marl.fedqmix.settings import Shared, write_app  # noqa: E402
 from marl.settings import PRESETS, RunSettings  # noqa: E402
 from radiotwin.errors import RunFailed  # noqa: E402
-from studies.flower import Processes  # noqa: E402
+from tests.marl.flower_processes import Processes  # noqa: E402
 
 MAX_S = 1800  # of a test, on a machine that does much else
 

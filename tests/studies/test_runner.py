@@ -19,7 +19,6 @@ from studies.__main__ import app
 from studies.runner import Study, code_version, read_rows
 
 RESULTS = Path(__file__).parents[2] / "docs" / "results"
-OF_VERSION_0_1 = ("-fly-again", "-restart-0.3", "-measure-planner")  # options that are gone
 CALLS: list[tuple[int, str]] = []
 STOP: list[str] = []  # a row that is interrupted
 
@@ -98,23 +97,23 @@ def test_several_processes_do_the_same(run, tmp_path):
 
 
 def test_a_killed_process_leaves_whole_rows(tmp_path):
-    words = ["pays", "--only", "rbm-nominal-greedy,rbm-loss-greedy,rbm-volumes-greedy", "--seeds", "1",
-             "--out", str(tmp_path)]
+    words = ["curve", "--only", "-traced-greedy,-traced-random", "--seeds", "1", "--out", str(tmp_path)]
     process = subprocess.Popen([sys.executable, "-m", "studies", *words], cwd=RESULTS.parents[1],
                                stdout=subprocess.DEVNULL, env=os.environ | {"OMP_NUM_THREADS": "1"})
-    while process.poll() is None and not (tmp_path / "pays.json").exists():
+    while process.poll() is None and not (tmp_path / "curve.json").exists():
         time.sleep(0.02)
     process.send_signal(signal.SIGKILL)
     process.wait(timeout=60)
-    kept = read_rows("pays", tmp_path)
+    kept = read_rows("curve", tmp_path)
     assert kept
     result = CliRunner().invoke(app, [*words, "--resume"])
     assert result.exit_code == 0, result.output
-    rows = read_rows("pays", tmp_path)
-    assert len(rows) == 3 and all(row in rows for row in kept)
-    committed = {row["name"]: row["results"] for row in read_rows("pays", RESULTS)}
+    rows = read_rows("curve", tmp_path)
+    assert len(rows) == 4 and all(row in rows for row in kept)
+    committed = {(row["name"], row["seed"]): row["results"]["curve"] for row in read_rows("curve", RESULTS)}
     for row in rows:  # the same numbers as those that are kept
-        assert row["results"]["ratios"] == pytest.approx(committed[row["name"]]["ratios"], abs=2e-4)
+        name, ratio = (row["name"], row["seed"]), row["results"]["curve"]["truth_ratio"]
+        assert ratio == pytest.approx(committed[name]["truth_ratio"], abs=2e-4)
 
 
 def test_rows_of_other_settings_and_damaged_files_are_refused(run, tmp_path):
@@ -131,11 +130,11 @@ def test_rows_of_other_settings_and_damaged_files_are_refused(run, tmp_path):
 
 
 @pytest.mark.parametrize("words, parts", [
-    (["magic"], ["'magic'", "curve, federation"]),
+    (["magic"], ["'magic'", "curve, belief"]),
     ([], ["--list"]),
     (["curve", "--only", "segmented-greedy", "--out", "new"], ["no scene runs/paper_rbm, runs/paper_rdm", "--only"]),
     (["curve", "--only", "magic"], ["--only magic", "rbm-traced-fedqmix-nn"]),
-    (["quality", "--report", "--out", "nothing"], ["nothing/quality.json holds no finished row"]),
+    (["models", "--report", "--out", "nothing"], ["nothing/models.json holds no finished row"]),
     (["curve", "--seeds", "0"], ["--seeds"])])
 def test_bad_input_is_one_message_and_leaves_nothing(words, parts, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -151,16 +150,16 @@ def test_all_studies_are_listed():
 
 def test_the_report_remakes_the_committed_tables_and_figures(tmp_path, monkeypatch):
     """Figures are compared by size: fonts differ between machines."""
-    for path in RESULTS.glob("*.json"):
-        shutil.copy(path, tmp_path)
+    for name in runner.MODULES:
+        shutil.copy(RESULTS / f"{name}.json", tmp_path)
     monkeypatch.chdir(RESULTS.parents[1])
     result = CliRunner().invoke(app, ["--report", "--out", str(tmp_path)])
     assert result.exit_code == 0, result.output
-    for path in set(RESULTS.glob("*.md")) - {RESULTS / "main.md"}:  # which is no study's
-        assert (tmp_path / path.name).read_text() == path.read_text(), path.name
-    names = {path.name for path in (RESULTS / "figures").iterdir()}
-    assert {path.name for path in (tmp_path / "figures").iterdir()} == names
-    for name in names:
+    for name in runner.MODULES:
+        assert (tmp_path / f"{name}.md").read_text() == (RESULTS / f"{name}.md").read_text(), name
+    drawn = [path.name for path in (tmp_path / "figures").iterdir()]
+    assert {"curve.png", "foreign.png", "readings.png"} <= set(drawn)
+    for name in drawn:
         sizes = [(folder / "figures" / name).stat().st_size for folder in (tmp_path, RESULTS)]
         assert sizes[0] == pytest.approx(sizes[1], rel=0.1), name
 
@@ -171,6 +170,5 @@ def test_committed_rows_are_those_of_todays_studies(name):
     study, rows = runner.load_study(name), read_rows(name, RESULTS)
     assert rows
     for row in rows:
-        if not row["name"].endswith(OF_VERSION_0_1):
-            assert study.cases(row["seed"])[row["name"]] == row["settings"], row["name"]
+        assert study.cases(row["seed"])[row["name"]] == row["settings"], row["name"]
         assert row["study"] == name and row["version"] and json.dumps(row["results"], allow_nan=False)

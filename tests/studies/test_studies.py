@@ -6,19 +6,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from marl.mission import Known, make_mission
-from radiotwin.maps.survey import segmented_truth
-from studies import (
-    closeloop,
-    closeloop_real,
-    disturbances,
-    learning,
-    models,
-    speed,
-    twins,
-)
+from studies import closeloop, closeloop_real, learning, models, speed
 from studies.runner import make_row, read_rows
-from studies.tables import Curve, over_seeds, quantiles, read_frame, with_sd
+from studies.tables import Curve, over_seeds, read_frame, with_sd
 from tests.undeclared.cases import case
 
 RESULTS = Path(__file__).parents[2] / "docs" / "results"
@@ -52,67 +42,6 @@ def test_algorithm_1_has_a_row_for_each_round_and_the_seed_decides(small_scene):
 
 
 @pytest.mark.slow
-def test_a_twin_is_judged_by_the_truth(small_scene):
-    settings = {f"small-{model}": {"model": model, "survey_flights": [1, 3], "noise_db": 1.0}
-                for model in ("segmented_nn", "log_distance", "kriging")}
-    rows = rows_of(twins.judge_twin, small_scene, settings)
-    curves = rows.set_index("name")["curve"]
-    network, line = curves["small-segmented_nn"], curves["small-log_distance"]
-    assert network["real_episodes"] == [1, 3] and network["links"][0] * 3 == network["links"][1]
-    assert all(len(errors_m) == 4 for errors_m in network["location_errors_m"])
-    assert network["map_rmse_db"][1] < 2 < line["map_rmse_db"][1]  # the truth is segmented
-    assert "| kriging | 3 |" in twins.quality_table(rows) and set(twins.quality_figures(rows)) == {"quality"}
-
-
-def test_training_in_a_twin_is_judged_in_the_truth(small_scene):
-    base = twins.twin_cases(0)["rbm-nn"] | {"episodes": 100, "flights": 8, "survey_flights": 2,
-                                            "planner_iterations": 500}
-    rows = rows_of(twins.train_in, small_scene, {f"small-{name}": base | {"twin": name} for name in
-                                                 ("segmented", "log-distance", "truth")})
-    by_name = rows.set_index("name")
-    assert by_name["fidelity"]["small-segmented"]["correlation"] > 0.95
-    assert by_name["map_rmse_db"]["small-segmented"] < by_name["map_rmse_db"]["small-log-distance"]
-    truth = by_name.loc["small-truth"]
-    assert truth["plan_truth_ratio"] == pytest.approx(truth["plan_twin_ratio"], abs=0.05)
-    assert truth["plan_truth_ratio"] > truth["trained_truth_ratio"] > 0  # a hundred episodes teach little
-    assert "log-distance" in twins.twin_table(rows) and set(twins.twin_figures(rows)) == {"twin"}
-
-
-def test_the_same_actions_collect_the_same_in_a_twin_without_error(small_scene):
-    real = make_mission(small_scene, segmented_truth(small_scene), Known.truth(small_scene))
-    silent = real._replace(sigma_db=np.zeros_like(real.sigma_db))
-    same = twins.fidelity(silent, silent, 10, 0)
-    assert same["correlation"] == pytest.approx(1) and same["device_correlation"] == pytest.approx(1)
-    assert abs(same["bias"]) < 1e-9 and same["rmse"] < 1e-9
-    weaker = twins.fidelity(silent, silent._replace(snr_db=silent.snr_db - 6), 10, 0)
-    assert weaker["bias"] < -0.02 and weaker["rmse"] >= -weaker["bias"]
-
-
-def test_every_method_flies_where_things_are_not_as_thought(small_scene):
-    quick = {"episodes": 40, "flights": 6, "truths": 2, "planner_iterations": 200, "replan_iterations": 20}
-    settings = {name.replace("rbm", "small"): {key: quick.get(key, value) for key, value in each.items()}
-                for name, each in disturbances.pays_cases(0).items() if name.startswith("rbm-everything")}
-    rows = rows_of(disturbances.fly_disturbed, small_scene, settings)
-    assert len(rows) == 6 and all(len(ratios) == 6 for ratios in rows["ratios"])
-    by_name = rows.set_index("name")
-    assert by_name["curve"]["small-everything-policy"]["episodes"] == [40]
-    table = disturbances.pays_table(rows)
-    assert f"{np.mean(by_name['ratios']['small-everything-plan']):.3f}" in table and "| all three |" in table
-
-
-def test_displaced_devices_are_on_free_ground_as_far_off_as_said(small_scene):
-    moved = disturbances.displaced(small_scene, np.random.default_rng(0))
-    off_m = np.linalg.norm(moved.device_m - small_scene.device_m, axis=1)
-    low_m, high_m = disturbances.OFF_M
-    assert (off_m >= low_m).all() and (off_m <= high_m).all()
-    assert not moved.city.inside(moved.device_m).any()
-    world = disturbances.make_world(small_scene, "positions", False, 3, np.random.default_rng(0))
-    assert len(world.real) == 3 and not np.array_equal(world.real[0].snr_db, world.believed.snr_db)
-    np.testing.assert_array_equal(world.real[0].known_m, world.believed.known_m)
-    assert world.believed.uav_link_db[0] < world.believed.threshold_db
-
-
-@pytest.mark.slow
 def test_channel_models_are_scored(small_scene):
     rows = rows_of(models.score_models, small_scene, {"small-segmented": models.models_cases(0)["rbm-segmented"]
                                                       | {"flights": 2}})
@@ -128,12 +57,6 @@ def test_speeds_are_measured(small_scene, part, monkeypatch):
     assert f"| {part} | " in speed.speed_table(rows)
 
 
-def test_the_tuning_table_says_what_differs_from_the_defaults_as_options():
-    settings = learning.case("rdm", "traced", "qmix", measure="policy", td_lambda=0.6) | {"fly_again": True}
-    assert learning.options(settings) == "`--measure policy --td-lambda 0.6 --fly-again true`"  # of version 0.1
-    assert learning.options(learning.case("rdm", "traced", "qmix")) == "as it is"
-
-
 def test_curves_are_means_over_seeds_and_say_what_a_ratio_takes():
     curve = over_seeds(pd.Series([{"real_episodes": [1, 2, 4], "truth_ratio": ratios}
                                   for ratios in ([0.2, 0.6, 0.5], [0.4, 0.8, 0.9])]))
@@ -143,12 +66,6 @@ def test_curves_are_means_over_seeds_and_say_what_a_ratio_takes():
     flat = Curve(np.array([1.0]), np.array([0.4]), np.zeros(1))
     assert learning.common_ratio({"fedqmix-nn": curve, "qmix-truth": flat}) == pytest.approx(0.38)
     assert with_sd([0.5]) == "0.500" and with_sd([]) == "–"
-
-
-def test_a_device_without_estimate_counts_as_far_away():
-    assert quantiles([1.0, 2.0, 3.0]) == pytest.approx((2.0, 2.8, 3.0, 0.0))
-    median, most, worst, far = quantiles([1.0, 2.0, None, 150.0])
-    assert (median, worst, far) == (76.0, np.inf, 0.5) and most == np.inf
 
 
 def test_what_was_recovered_follows_from_the_parameters_that_were_found():
