@@ -93,10 +93,7 @@ class CensoredRegression:
         """Compute mean and error scale of the readings behind the receiver, with their derivatives.
 
         If the receiver's response is not linear, by quadrature over the arriving level.
-
-        Args:
-            coefficients: (p0 + p1,).
-            scale_db: (groups,) error scales [dB].
+        Coefficients are (p0 + p1,), error scales (groups,) [dB].
         """
         arriving_db, law_slope = self.arriving(coefficients)
         scale = np.hypot(scale_db[self.group], self.random_effect_sd_db)
@@ -185,10 +182,7 @@ class FitResult:
 def fit(problem: CensoredRegression, start: FitResult | None = None) -> FitResult:
     """Maximise the posterior of coefficients and error scales by damped Newton steps.
 
-    Args:
-        problem: n levels and p coefficients.
-        start: an earlier fit to start from; the coefficients that it lacks are the last ones and
-            start at 0.
+    `start`: an earlier fit; the coefficients that it lacks are the last ones and start at 0.
     """
     p, groups = len(problem.prior_sd_db), int(problem.group.max()) + 1
     if start is not None and len(start.coefficients) <= p and len(start.scale_db) >= groups:
@@ -257,10 +251,9 @@ def _slope_and_hessian(problem: CensoredRegression, predicted: Linearisation,
                        precision: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Compute the derivatives of the log-posterior for one Newton step.
 
-    Returns:
-        (p,) gradient of the log-likelihood in the coefficients, (p, p) negative Hessian of the
-        log-posterior, (groups,) step of the log scales, in which a row counts by the share of its
-        error that passes the receiver, and the approximate gain of that step [nats].
+    Gradient (p,) of the log-likelihood, negative Hessian (p, p) of the log-posterior, step of the
+    log scales (groups,), in which a row counts by the share of its error that passes the receiver,
+    and the approximate gain of that step [nats].
     """
     slope, curvature, scale_slope = problem.reading_law(
         predicted.mean_db, predicted.scale_db).derivatives(problem.level_db)

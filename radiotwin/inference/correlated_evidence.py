@@ -70,12 +70,9 @@ class CorrelatedEvidence:
             seed: int) -> Self:
         """Build the evidence for the correlation length with the highest marginal likelihood.
 
-        Args:
-            series: (n,) label of the field that each row belongs to.
-            position_m: (n, 3) positions [m].
-            z: (n,) standardised residuals; NaN: not used.
-            nuisance: columns fitted in every likelihood.
-            seed: of the random choice of rows, if there are more than `MAX_ROWS`.
+        Residuals z (n,), NaN: not used, at positions (n, 3) [m] have a field for each label of
+        `series` (n,); `nuisance` is fitted in every likelihood. `seed` draws rows if there are more
+        than `MAX_ROWS`.
         """
         rng = np.random.default_rng(seed)
         chosen = []
@@ -131,14 +128,8 @@ class CorrelatedEvidence:
                    start: np.ndarray = START) -> tuple[float, np.ndarray]:
         """Fit noise and field variance by marginal likelihood, in the eigenbasis of the field.
 
-        Args:
-            z: (m,) residuals, transformed by `rotated`.
-            columns: (m, q) columns, transformed alike.
-            prior_sd: (q,) prior standard deviations of their coefficients.
-            start: (2,) initial logarithms of the variances, see `START`.
-
-        Returns:
-            log marginal likelihood [nats], and the best (2,) logarithms of the variances.
+        Residuals (m,) and columns (m, q) are transformed by `rotated`; `start` as in `START`.
+        Returns the log marginal likelihood [nats], and the best (2,) logarithms of the variances.
         """
         if not len(z):
             return 0.0, START
@@ -157,12 +148,9 @@ class CorrelatedEvidence:
 
     def at(self, z: np.ndarray, columns: np.ndarray, prior_sd: np.ndarray,
            theta: np.ndarray) -> tuple[float, np.ndarray]:
-        """Compute the log marginal likelihood of rotated residuals for given log variances.
+        """Compute the log marginal likelihood of rotated residuals [nats], and its gradient (2,).
 
         `theta` (2,): log noise variance, and log of field over noise variance.
-
-        Returns:
-            log marginal likelihood [nats], and its gradient (2,) in theta.
         """
         variance = np.exp(theta[0]) * (1.0 + np.exp(theta[1]) * self.spectrum)
         share = 1.0 - np.exp(theta[0]) / variance  # of the variance that is the field's

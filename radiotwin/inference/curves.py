@@ -86,11 +86,8 @@ class Curves:
 def compare_curves(found: Statistic, curve: np.ndarray, prior_sd: float, part: str) -> Curves:
     """Estimate how much each curve varies over its bins, and how likely peers vary as much.
 
-    Args:
-        found: levels of k bins; a bin without a finite level is not used.
-        curve: (k,) index of each bin's curve.
-        prior_sd: prior standard deviation of the bins of a curve that does not stand out.
-        part: name of this part of the data.
+    `found` are levels of k bins, `curve` (k,) each bin's curve, `prior_sd` that of the bins of a
+    curve that does not stand out, `part` the name of this part of the data.
     """
     count = int(curve.max()) + 1
     known = np.isfinite(found.value) & (found.error > 0)
@@ -131,11 +128,7 @@ OF_PEERS = _log_normal(LOG_GRID, PEERS_LOG_SD)  # (grid, grid), row: common stan
 
 
 def _log_null(log_likelihood: np.ndarray, judged: np.ndarray, prior_sd: float) -> np.ndarray:
-    """Compute the log likelihood (p,) that each curve varies as its peers do, leave-one-out.
-
-    The common standard deviation of the peers follows from the prior and all other curves, of which
-    some may stand out themselves.
-    """
+    """Compute the log likelihood (p,) that each curve varies as its peers do, leave-one-out."""
     given = logsumexp(log_likelihood[:, None] + OF_PEERS, axis=2)
     anywhere = logsumexp(log_likelihood - np.log(len(SD_GRID)), axis=1)
     robust = np.logaddexp(np.log1p(-OUTLIER_SHARE) + given,

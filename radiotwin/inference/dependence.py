@@ -29,13 +29,9 @@ class Series:
 
 
 def levels_of(values: np.ndarray) -> np.ndarray | None:
-    """Bin a variable: integer labels as they are, other values by quantiles.
+    """Bin a variable (n,): integer labels as they are, others by quantiles, NaN in one more bin.
 
-    Args:
-        values: (n,) labels or values; NaN is one more bin.
-
-    Returns:
-        (n,) bin from 0; None if there are too few bins, too many labels, or most values are NaN.
+    None if there are too few bins, too many labels, or most values are NaN.
     """
     if values.dtype.kind in "iu":
         level = np.unique(values, return_inverse=True)[1]
@@ -53,11 +49,8 @@ def permutation_p_value(level: np.ndarray, z: np.ndarray, series: Series,
     """Test by permutation whether the means of values z (n,) differ between bins `level` (n,).
 
     If the bin changes within most series, each series is rotated by a random shift, which keeps
-    neighbours together; else the series exchange their means. (`scipy.stats.permutation_test`
-    does neither.) Stops early (Besag and Clifford 1991, 'Sequential Monte Carlo p-values').
-
-    Returns:
-        p-value, above 0.
+    neighbours together; else the series exchange their means. (`scipy.stats.permutation_test` does
+    neither.) Stops early (Besag and Clifford 1991, 'Sequential Monte Carlo p-values'). Above 0.
     """
     level, z, count = level[series.order], z[series.order], np.maximum(np.bincount(level), 1)
     observed = _between(level, z, count)

@@ -36,20 +36,11 @@ def limits_of(limit_db: Limit, n: int) -> np.ndarray:
 
 def gaussian_nll(level_db: np.ndarray, mean_db: np.ndarray, sd_db: np.ndarray,
                  limit_db: Limit) -> np.ndarray:
-    """Compute the negative log-likelihood of each level under the Gaussian Tobit model.
+    """Compute the negative log-likelihood [nats] of each level [dB] under the Gaussian Tobit model.
 
-    The arguments broadcast against each other. A blank contributes -log P(level < limit) =
-    -log Phi((limit - mean) / sd) (Tobin 1958, 'Estimation of relationships for limited dependent
-    variables').
-
-    Args:
-        level_db: measured [dB]; NaN: not detected.
-        mean_db: expected [dB].
-        sd_db: standard deviation [dB].
-        limit_db: limit of detection [dB]; None or -inf: unknown, a blank contributes 0.
-
-    Returns:
-        [nats], of the broadcast shape.
+    The arguments broadcast. NaN is not detected, and contributes -log P(level < limit) = -log
+    Phi((limit - mean) / sd) (Tobin 1958, 'Estimation of relationships for limited dependent
+    variables'), or 0 if the limit is unknown.
     """
     missing = np.isnan(level_db)
     seen = 0.5 * ((level_db - mean_db) / sd_db) ** 2 + np.log(sd_db) + HALF_LOG_2PI
@@ -96,14 +87,7 @@ def gaussian_nll_torch(level: torch.Tensor, mean: torch.Tensor, log_sd: torch.Te
                        censored: torch.Tensor) -> torch.Tensor:
     """Compute `gaussian_nll` in torch, differentiable in mean and log_sd; everything broadcasts.
 
-    Args:
-        level: measured level; the limit of detection where `censored`.
-        mean: expected level, in the unit of `level`.
-        log_sd: natural logarithm of the standard deviation.
-        censored: bool, True if not detected.
-
-    Returns:
-        [nats], of the broadcast shape.
+    `level` is the limit of detection where `censored` (bool); `log_sd` a natural logarithm.
     """
     import torch
 
@@ -137,14 +121,10 @@ def fit_line(log_distance: np.ndarray, level_db: np.ndarray,
              limit_db: Limit) -> LogDistanceLine:
     """Fit the log-distance line by Tobit maximum likelihood, with a weak prior on the exponent.
 
-    The Tobit likelihood has one maximum only (Olsen 1978, 'Note on the uniqueness of the maximum
-    likelihood estimator for the Tobit model', Econometrica 46), so the least-squares line through
-    the detected levels is a safe start.
-
-    Args:
-        log_distance: (n,) log10(d / 1 m).
-        level_db: (n,) measured levels [dB], at least two of them detected; NaN: not detected.
-        limit_db: limit of detection [dB]; it must be known for every blank.
+    At log10(d / 1 m) (n,), levels (n,) [dB], NaN: not detected, at least two detected; the limit
+    must be known for every blank. The likelihood has one maximum only (Olsen 1978, 'Note on the
+    uniqueness of the maximum likelihood estimator for the Tobit model', Econometrica 46), so the
+    least-squares line through the detected levels is a safe start.
     """
     detected = ~np.isnan(level_db)
     x, y = log_distance[detected], level_db[detected]
@@ -183,13 +163,8 @@ def shift_line(line: LogDistanceLine, log_distance: np.ndarray, level_db: np.nda
                limit_db: Limit, prior_db: float, prior_sd_db: float) -> LogDistanceLine:
     """Shift a line up or down to fit few or no levels: maximum a posteriori of the intercept.
 
-    Args:
-        line: log-distance line of other links.
-        log_distance: (n,) log10(d / 1 m).
-        level_db: (n,) measured levels [dB]; NaN: not detected.
-        limit_db: limit of detection [dB]; a blank contributes nothing if it is unknown.
-        prior_db: mean of the shift's normal prior [dB].
-        prior_sd_db: standard deviation of that prior [dB].
+    Levels (n,) [dB] at log10(d / 1 m) (n,); NaN: not detected, which contributes nothing if the
+    limit is unknown. The shift has a normal prior of `prior_db` and `prior_sd_db`.
     """
 
     def negative_log_posterior(shift_db: float) -> float:
@@ -204,15 +179,9 @@ def shift_line(line: LogDistanceLine, log_distance: np.ndarray, level_db: np.nda
 
 
 def fit_sd_db(level_db: np.ndarray, mean_db: np.ndarray, limit_db: Limit) -> float:
-    """Fit the standard deviation of levels about given means by Tobit maximum likelihood.
+    """Fit the standard deviation [dB] of levels (n,) about means (n,) by Tobit maximum likelihood.
 
-    Args:
-        level_db: (n,) measured levels [dB]; NaN: not detected.
-        mean_db: (n,) means [dB].
-        limit_db: limit of detection [dB]; a blank contributes nothing if it is unknown.
-
-    Returns:
-        standard deviation [dB], from MIN_SD_DB to MAX_SD_DB.
+    From MIN_SD_DB to MAX_SD_DB. NaN: not detected; such a blank needs a limit to contribute.
     """
 
     def negative_log_likelihood(log_sd: float) -> float:

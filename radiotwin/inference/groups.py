@@ -156,14 +156,11 @@ def medians(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
 
 def levels(values: np.ndarray, groups: Groups, lasting_sd: float,
            least_scale: float, is_bin: bool = False) -> Statistic:
-    """Estimate the level of each group: Huber's M-estimate, one step from the median.
+    """Estimate the level of each group of values (n,): Huber's M-estimate, a step from the median.
 
-    Args:
-        values: (n,), not NaN for members of groups.
-        groups: k groups of values.
-        lasting_sd: sd of the error shared at all times, e.g. by a place, see `LastingErrors`.
-        least_scale: lower bound of the scale of a group's values, e.g. their rounding step.
-        is_bin: whether the groups are bins of curves, which may be small.
+    `lasting_sd` is that of the error shared at all times, see `LastingErrors`; `least_scale` bounds
+    the scale of a group's values, e.g. by their rounding step; `is_bin`: bins of curves may be
+    small.
     """
     x, group, count = values[groups.row], groups.group, groups.count
     middle = medians(x, group, count)
@@ -179,12 +176,8 @@ def log_scatters(values: np.ndarray, groups: Groups, lasting_sd: float | None,
                  scale: float) -> Statistic:
     """Estimate the log scatter of each group: log of the mean absolute deviation from its median.
 
-    Args:
-        values: (n,), not NaN for members of groups.
-        groups: k groups of values.
-        lasting_sd: sd of the log scatter between lasting units, e.g. places; None: values are
-            independent.
-        scale: usual scatter, the unit of the deviations, which are clipped at `MAX_SCALES`.
+    `lasting_sd` is that of the log scatter between lasting units; None: values are independent.
+    `scale` is the usual scatter, the unit of the deviations, which are clipped at `MAX_SCALES`.
     """
     x, group, count = values[groups.row], groups.group, groups.count
     middle = medians(x, group, count)
@@ -213,9 +206,8 @@ def _with_error(value: np.ndarray, step: np.ndarray, influence: np.ndarray, grou
                 lasting_sd: float | None, is_bin: bool = False) -> Statistic:
     """Add standard errors to a statistic (k,) of groups; NaN where a group is too small.
 
-    Values of a passing unit share errors once, those of a lasting unit (e.g. a place) always. The
-    error is a sandwich over passing units, of the influence (m,) of members times `step` (k,), plus
-    that of lasting units in quadrature. `lasting_sd` None: values are independent. Bins have few
+    A sandwich over passing units, of the influence (m,) of members times `step` (k,), plus the
+    error of lasting units in quadrature; `lasting_sd` None: values are independent. Bins have few
     units, so their sandwich is shrunk to the mean ratio over all bins.
     """
     count = groups.count
@@ -284,12 +276,8 @@ class PeerComparison:
 def compare_with_peers(found: Statistic, prior_spread: float, dof: float) -> PeerComparison:
     """Measure how far each group is from the median of its peers, which are all other groups.
 
-    The robust spread of the peers is shrunk to a prior. NaN for a group without a value.
-
-    Args:
-        found: statistic of k groups.
-        prior_spread: prior standard deviation between peers.
-        dof: degrees of freedom of the Student t between peers.
+    The robust spread of the peers is shrunk to `prior_spread`; `dof` are those of the Student t
+    between peers. NaN for a group without a value.
     """
     value, error = found.value, found.error
     size, total = np.full(len(value), np.nan), np.full(len(value), np.nan)
@@ -373,15 +361,10 @@ def subtract_end_levels(found: Statistic, ends: tuple[np.ndarray, ...]) -> Stati
 
 
 def subtract_unit_errors(values: np.ndarray, label: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """Subtract from values (n,) the error that all groups share in a unit, such as a place.
+    """Subtract from values (n,) the error that all groups (n,) share in a unit (n,), e.g. a place.
 
     Two-way fit by medians, levels of groups plus errors of units; the error of a unit is shrunk to
     0, fully if only one group was in it.
-
-    Args:
-        values: (n,).
-        label: (n,) group.
-        unit: (n,) unit whose error lasts, see `Units`.
     """
     cell_of, of_group = _pairs(label, unit)
     size = np.int64(unit.max(initial=0) + 1)

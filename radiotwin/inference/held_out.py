@@ -15,17 +15,10 @@ SUM_WEIGHT = 1e4  # weight of the equation "weights sum to one", relative to the
 
 
 def deal_groups(group: np.ndarray, max_folds: int, rng: np.random.Generator) -> np.ndarray:
-    """Deal groups to folds of about equal size, largest group first, each to the smallest fold.
+    """Deal groups (n,) to folds (n,) of about equal size, largest first, each to the smallest.
 
-    As scikit-learn's `GroupKFold`, but groups of equal size come in random order.
-
-    Args:
-        group: (n,) label of the group.
-        max_folds: fewer where there are fewer groups.
-        rng: decides among groups of equal size.
-
-    Returns:
-        (n,) fold.
+    As scikit-learn's `GroupKFold`, but groups of equal size come in random order; fewer folds where
+    there are fewer groups.
     """
     groups, index, size = np.unique(group, return_inverse=True, return_counts=True)
     load = np.zeros(min(max_folds, len(groups)))
@@ -41,15 +34,8 @@ def convex_weights(error: np.ndarray, share: np.ndarray, pull: float) -> np.ndar
 
     Minimises mean((error @ w)^2) / m + pull * |w - best|^2, summed over both sets of weights, where
     m is the mean square error of the best single prediction. With equal shares, another prediction
-    must have a mean square error lower by 4 `pull` m to be taken instead.
-
-    Args:
-        error: (n, k) measured minus predicted, of k predictions.
-        share: (n,) in 0..1, share of the second set of weights.
-        pull: strength of the shrinkage.
-
-    Returns:
-        (2, k) weights: the first set (share 0) and the second (share 1).
+    must have a mean square error lower by 4 `pull` m to be taken instead. Errors are (n, k), shares
+    of the second set (n,) in 0..1, weights (2, k).
     """
     n, k = error.shape
     square = np.square(error).mean(axis=0)

@@ -49,12 +49,10 @@ class Scores:
     def covariances(self, clusterings: list[np.ndarray]) -> list[np.ndarray]:
         """Compute covariances (q, q), each scaled so that ±1.645 sd is a 90 % interval.
 
-        The first is that of independent rows, then one per clustering of two or more clusters, its
-        sd widened by Student's t. The interval of a parameter, or contrast, is the widest of them.
-        With too few effective clusters, a parameter keeps the sd of independent rows.
-
-        Args:
-            clusterings: (n,) integer labels of rows with correlated errors, e.g. places, flights.
+        The first is that of independent rows, then one per clustering (n,), e.g. by place or
+        flight, of two or more clusters, its sd widened by Student's t. The interval of a parameter,
+        or contrast, is the widest of them. With too few effective clusters, a parameter keeps the
+        sd of independent rows.
         """
         bread, information = self.bread, _dense(self.root.T @ self.root)
         independent = bread @ (information + np.diag(self.prior_score_variance)) @ bread
@@ -78,8 +76,7 @@ class Scores:
                    count: int) -> np.ndarray:
         """Compute the covariance (q, q) for clusters (n,) with independent errors.
 
-        Few clusters pull the fit towards themselves: then by the jackknife, which leaves out each
-        in turn. It skips a parameter that only the prior would determine without that cluster.
+        The jackknife skips a parameter that only the prior would determine without a cluster.
         """
         sums = _sum_by_cluster(self.score, cluster, count)
         if count > MAX_LEFT_OUT:

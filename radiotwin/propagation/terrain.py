@@ -112,16 +112,11 @@ def knife_edge_db(nu: np.ndarray) -> np.ndarray:
 
 def _edges(profiles: Profiles, height_m: np.ndarray,
            end_m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the links that are blocked, and where the horizons of their two ends meet.
+    """Return which links (n,) are blocked, and where the horizons of their two ends meet.
 
-    Args:
-        profiles: profiles of n links.
-        height_m: (n, p) heights of the profile [m].
-        end_m: (n, 2) heights of the antennas [m].
-
-    Returns:
-        (n,) bool, blocked; for the m blocked links, distances (m,) from the first end and heights
-        (m,) of the meeting point, which is Bullington's single knife edge [m].
+    That point, Bullington's single knife edge, is given by its distances (m,) from the first end
+    and heights (m,) [m]. `height_m` (n, p) are the heights of the profiles, `end_m` (n, 2) of
+    antennas [m].
     """
     at_m, back_m = profiles.at_m, profiles.length_m[:, None] - profiles.at_m
     curved_m = height_m + at_m * back_m / (2 * EARTH_RADIUS_M)
@@ -135,10 +130,7 @@ def _edges(profiles: Profiles, height_m: np.ndarray,
 
 def _bullington_db(profiles: Profiles, height_m: np.ndarray, end_m: np.ndarray,
                    wavelength_m: float) -> np.ndarray:
-    """Return the Bullington loss (n,) [dB], by one knife edge (ITU-R P.526-15, 4.5.1).
-
-    `height_m` (n, p) are the heights of the profile, `end_m` (n, 2) those of both antennas [m].
-    """
+    """Return the Bullington loss (n,) by one knife edge [dB] (4.5.1); arguments as in `_edges`."""
     length_m = profiles.length_m[:, None]
 
     def parameter(rows: np.ndarray, at_m: np.ndarray, over_datum_m: np.ndarray) -> np.ndarray:
@@ -158,10 +150,7 @@ def _bullington_db(profiles: Profiles, height_m: np.ndarray, end_m: np.ndarray,
 
 
 def _smooth_m(profiles: Profiles) -> np.ndarray:
-    """Fit a smooth surface to the ground; return its heights (n, 2) at both ends [m].
-
-    By ITU-R P.526-15, 4.5.2; lowered if the ground blocks the link, and never above the ground.
-    """
+    """Fit a smooth surface to the ground; return its heights (n, 2) at both ends [m] (4.5.2)."""
     length_m, end_m, ground_m = profiles.length_m[:, None], profiles.end_m, profiles.ground_m
     at_m = np.column_stack([np.zeros(len(length_m)), profiles.at_m, length_m])
     step_m, low_m, high_m = np.diff(at_m), ground_m[:, :-1], ground_m[:, 1:]
@@ -185,10 +174,7 @@ def spherical_earth_db(distance_m: np.ndarray, height_m: np.ndarray,
                        frequency_hz: float) -> np.ndarray:
     """Return the diffraction loss (n,) over a smooth 4/3 Earth [dB] (ITU-R P.526-15, 3.2).
 
-    Args:
-        distance_m: (n,) horizontal distance [m].
-        height_m: (n, 2) antenna heights above the ground [m].
-        frequency_hz: of the radio [Hz]; vertical polarisation.
+    Horizontal distances (n,), heights of both antennas (n, 2) above ground; vertical polarisation.
     """
     first, second = height_m.T
     root_m = np.sqrt(height_m).sum(axis=1)

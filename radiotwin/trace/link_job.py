@@ -166,16 +166,19 @@ def longest_path_m(scene: Scene) -> float:
     return float(wavelength_m / (4 * np.pi) * 10 ** (budget_db / 20))
 
 
-def tile_of(device_m: np.ndarray, points_m: np.ndarray, radius_m: float, longest_m: float
-            ) -> Tile:
+def tile_of(device_m: np.ndarray, points_m: np.ndarray, radius_m: float | None, longest_m: float
+            ) -> Tile | None:
     """Return the tile, the part of a city to trace in, for links from a device to points (n, 3).
 
     Positions are in metres. Shapes farther than the tile's radius from the convex hull of device
     (3,) and points are left out. The radius is `radius_m`, or less if even paths of the length
-    `longest_m` stay closer to the straight line between their ends.
+    `longest_m` stay closer to the straight line between their ends. None: the whole city, if
+    `radius_m` is None or infinite.
     """
     import shapely
 
+    if radius_m is None or math.isinf(radius_m):
+        return None
     nearest_m = np.linalg.norm(points_m - device_m, axis=1).min()
     aside_m = math.sqrt(max(longest_m**2 - nearest_m**2, 0.0)) / 2
     ends_m = np.vstack([device_m[:2], points_m[:, :2]])
@@ -293,74 +296,57 @@ class LinkBatch:
 def link_pieces(scene: Scene, settings: SolverSettings,
                 devices: Sequence[tuple[str, np.ndarray, Antenna | None]], points_m: np.ndarray,
                 size: int | None = None) -> tuple[list[LinkBatch], np.ndarray]:
-    """Divide the links from several devices to the same points into batches.
+    """Divide the links from several devices to the same points (n, 3) [m] into batches.
 
-    Points are batched in their order; where only a part of the city (a tile) is traced, batches
-    are of neighbouring points.
-
-    Args:
-        scene: City, UAVs' antenna and limit of detection.
-        settings: Settings of the solver.
-        devices: Prefix of the batches' names, position (3,) [m] and antenna of each device.
-        points_m: (n, 3) positions of the receivers [m].
-        size: Maximum number of points in a batch; None: `settings.batch_receivers`.
-
-    Returns:
-        The batches, device by device, and the indices (n,) of the points in the order in which
-        each device's batches hold them.
+    Points are batched in their order; where only a part of the city (a tile) is traced, batches are
+    of neighbouring points. Devices have a prefix of the batches' names, position (3,) [m] and
+    antenna. Batches have up to `size` points; None: `settings.batch_receivers`. Also returns the
+    indices (n,) of the points in the order in which each device's batches hold them.
     """
     size = size or settings.batch_receivers
+    longest_m = longest_path_m(scene)
     if settings.is_tiled:
         batches = batches_by_place(points_m, size)
-        longest_m = longest_path_m(scene)
     else:
         batches = [np.arange(start, min(start + size, len(points_m)))
                    for start in range(0, len(points_m), size)]
     pieces = []
     for name, device_m, antenna in devices:
         for number, batch in enumerate(batches):
-            tile = None
-            if settings.radius_m is not None and settings.is_tiled:
-                tile = tile_of(device_m, points_m[batch], settings.radius_m, longest_m)
+            tile = tile_of(device_m, points_m[batch], settings.radius_m, longest_m)
             pieces.append(LinkBatch(f"{name}-{number:05d}", device_m, points_m[batch],
                                     (antenna, scene.uav_antenna), settings.batch_receivers, tile))
     return pieces, np.concatenate([np.zeros(0, dtype=int), *batches])
 
 
-class _BatchSolver:
-    """Base of the callables that solve a batch.
+class SolveBatch:
+    """Computes the gains of a batch: along paths, in its tile or the whole city; or over cells.
 
-    The solver takes seconds to construct: this is done for the first batch. Pickled, the object
-    holds the geometry, so that another process reads no file.
+    The solver takes seconds to construct: this is done for the first batch, and for another tile.
+    Pickled, the object holds the geometry, so that another process reads no file.
     """
-
-    geometry_bytes = 0  # memory of the geometry in addition to the solver's
 
     def __init__(self, scene: Scene, settings: SolverSettings) -> None:
         self._city: Any = scene.xml_path  # or its shapes, when pickled; or a `PackedCity`
         self._frequency_hz, self._settings = scene.config.radio.frequency_hz, settings
+        self._lattice: Lattice = scene.lattice
+        self.geometry_bytes = 0  # memory of the geometry in addition to the solver's
+        if settings.is_tiled:
+            self._city = PackedCity.of(read_city(scene.xml_path))
+            self.geometry_bytes = GEOMETRY_COPIES * self._city.nbytes
         self._solver: Any = None
+        self._solved: tuple[Tile | None, int] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         city = read_city(self._city) if isinstance(self._city, Path) else self._city
         return self.__dict__ | {"_city": city, "_solver": None}
 
-
-class SolvePaths(_BatchSolver):
-    """Computes the gains of a batch along paths, see `PathGains`, in its tile or the whole city.
-
-    The solver of the last tile is kept: consecutive batches may share it.
-    """
-
-    def __init__(self, scene: Scene, settings: SolverSettings) -> None:
-        super().__init__(scene, settings)
-        if settings.is_tiled:
-            self._city = PackedCity.of(read_city(scene.xml_path))
-            self.geometry_bytes = GEOMETRY_COPIES * self._city.nbytes
-        self._solved: tuple[Tile | None, int] | None = None
-
     def __call__(self, piece: LinkBatch) -> np.ndarray:
-        """Return the gains (n,) of a batch [dB]."""
+        """Return the gains (n,) of a batch [dB]; with the solver `map` it is one altitude."""
+        if self._settings.solver == "map":
+            self._solver = self._solver or CellGains(self._city, self._frequency_hz,
+                                                     self._settings, self._lattice)
+            return self._solver.solve(piece.device_m, piece.points_m[0, 2])
         if self._solver is None or self._solved != (piece.tile, piece.batch_receivers):
             self._solver = None  # frees the memory of the last tile first
             settings = replace(self._settings, batch_receivers=piece.batch_receivers)
@@ -372,47 +358,26 @@ class SolvePaths(_BatchSolver):
         return self._solver.gains(piece.device_m, piece.points_m, piece.antennas)
 
 
-class SolveCells(_BatchSolver):
-    """Computes gains averaged over cells, see `CellGains`; a batch is one altitude."""
-
-    def __init__(self, scene: Scene, settings: SolverSettings) -> None:
-        super().__init__(scene, settings)
-        self._lattice: Lattice = scene.lattice
-
-    def __call__(self, piece: LinkBatch) -> np.ndarray:
-        """Return the gains (n,) of a batch [dB]."""
-        if self._solver is None:
-            self._solver = CellGains(self._city, self._frequency_hz, self._settings, self._lattice)
-        return self._solver.solve(piece.device_m, piece.points_m[0, 2])
-
-
 def link_job(scene: Scene, settings: SolverSettings,
              description: str) -> Job[LinkBatch, np.ndarray]:
     """Return the job for an executor: the function that traces a batch, and the memory it needs.
 
-    A batch of the solver `paths` that needs too much memory is halved. `description` is shown with
-    the progress.
-
-    Raises:
-        BadInput: The scene has antennas, and the solver is `map`.
+    A batch of the solver `paths` that needs too much memory is halved. BadInput if the scene has
+    antennas, and the solver is `map`.
     """
-    if settings.solver == "paths":
-        solve = SolvePaths(scene, settings)
-        return Job(description, solve, _resources(settings, solve.geometry_bytes), len,
-                   LinkBatch.halves, lambda first, second: np.concatenate([first, second]))
-    if scene.has_antennas:
+    if settings.solver == "map" and scene.has_antennas:
         raise BadInput(f"{scene.folder / 'scene.toml'} declares antennas, which the solver 'map' "
                        "does not know; use the solver 'paths'")
-    return Job(description, SolveCells(scene, settings), _resources(settings), len)
-
-
-def _resources(settings: SolverSettings, geometry_bytes: int = 0) -> Resources:
-    """Return the memory, and share of the GPU, that a worker needs to solve a batch."""
-    memory_bytes = settings.memory_bytes() + geometry_bytes
-    if settings.compute_device == "cpu":
-        return Resources(memory_bytes)
-    # The GPU's memory; the use of main memory has not been measured
-    return Resources(memory_bytes, is_bound=False, gpu_share=share_of_gpu(memory_bytes))
+    solve = SolveBatch(scene, settings)
+    memory_bytes = settings.memory_bytes() + solve.geometry_bytes
+    resources = Resources(memory_bytes)
+    if settings.compute_device != "cpu":
+        # The GPU's memory; the use of main memory has not been measured
+        resources = Resources(memory_bytes, is_bound=False, gpu_share=share_of_gpu(memory_bytes))
+    if settings.solver == "map":
+        return Job(description, solve, resources, len)
+    return Job(description, solve, resources, len, LinkBatch.halves,
+               lambda first, second: np.concatenate([first, second]))
 
 
 def solve_lattice(scene: Scene, settings: SolverSettings, store: BatchStore, index: list[int],
@@ -420,22 +385,8 @@ def solve_lattice(scene: Scene, settings: SolverSettings, store: BatchStore, ind
                   description: str = "tracing") -> np.ndarray:
     """Trace the links from devices to lattice positions; batches in the cache are not solved again.
 
-    Args:
-        scene: City, devices and lattice.
-        settings: Settings of the solver.
-        store: Cache of the batches.
-        index: Indices of the devices.
-        executor: Where it runs.
-        columns: Indices of lattice positions; None: all.
-        label: Part of the batches' names; "": by the solver.
-        description: Shown with the progress.
-
-    Returns:
-        (devices, positions) gains [dB]; NaN where there is no path.
-
-    Raises:
-        BadInput: The scene cannot be read, or the cache cannot be written.
-        RunFailed: No usable libLLVM.
+    `columns` are indices of positions, None: all; `label` is a part of the batches' names. Returns
+    (devices, positions) gains [dB]; NaN where there is no path.
     """
     pieces, order = lattice_pieces(scene, settings, index, columns, label)
     job = link_job(scene, settings, description)
@@ -451,11 +402,8 @@ def solve_finer(scene: Scene, settings: SolverSettings, store: BatchStore, index
 
     The sample is 1 % of the positions (at least 8; drawn by the settings' seed) for all devices.
     With the solver `map`, which solves whole altitudes, it is the lowest altitude for the first
-    device. A call has a tenth of the receivers, in the same memory. Arguments are those of
-    `solve_lattice`.
-
-    Returns:
-        Rows (devices) and columns (positions) of the map, and their gains (rows, columns) [dB].
+    device. Returns rows (devices) and columns (positions) of the map, and their gains (rows,
+    columns) [dB].
     """
     total = len(scene.lattice.positions_m)
     if settings.solver == "paths":
@@ -463,7 +411,7 @@ def solve_finer(scene: Scene, settings: SolverSettings, store: BatchStore, index
         columns = np.sort(rng.choice(total, size=sample_size(scene), replace=False))
         rows = slice(0, len(index))
     else:
-        columns, rows = np.arange(_positions_per_altitude(scene)), slice(0, 1)
+        columns, rows = np.arange(scene.lattice.y_m.size * scene.lattice.x_m.size), slice(0, 1)
     return rows, columns, solve_lattice(scene, settings.finer(FINER), store, index[rows], executor,
                                         columns, "finer", "numerical noise")
 
@@ -482,21 +430,11 @@ def exchanged_calls(scene: Scene, settings: SolverSettings, devices: int) -> int
 
 def solve_exchanged(scene: Scene, settings: SolverSettings, store: BatchStore, index: list[int],
                     executor: Executor, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Trace links with their ends exchanged: rays start at the receivers.
+    """Trace links with their ends exchanged: rays start at the receivers (the solver `paths`).
 
-    By reciprocity the gains should not change.
-
-    Args:
-        scene: City, devices, antennas and lattice.
-        settings: Settings with the solver `paths`.
-        store: Cache of the map's batches.
-        index: Indices of the devices.
-        executor: Where it runs.
-        columns: Indices of lattice positions to choose from: evenly spaced ones are taken, about
-            as many as `exchanged_calls` allows.
-
-    Returns:
-        Indices of the positions that were solved, and their gains (devices, positions) [dB].
+    By reciprocity the gains should not change. Of the lattice positions `columns`, evenly spaced
+    ones are taken, about as many as `exchanged_calls` allows. Returns their indices, and their
+    gains (devices, positions) [dB].
     """
     by_antenna: dict[int, list[int]] = {}  # all points of a call have the same antenna
     for device in index:
@@ -506,15 +444,14 @@ def solve_exchanged(scene: Scene, settings: SolverSettings, store: BatchStore, i
               for start in range(0, len(devices), size)]
     max_calls = exchanged_calls(scene, settings, len(index))
     columns = columns[::max(1, -(-len(columns) * len(groups) // max_calls))]
-    longest_m = longest_path_m(scene) if settings.is_tiled else 0.0
+    longest_m = longest_path_m(scene)
     pieces = []
     for column in columns:
         point_m = scene.lattice.positions_m[column]
         for devices in groups:
             digest = hashlib.sha256(str(devices).encode()).hexdigest()[:12]
-            ends_m, tile = scene.device_m[devices], None
-            if settings.radius_m is not None and settings.is_tiled:
-                tile = tile_of(point_m, ends_m, settings.radius_m, longest_m)
+            ends_m = scene.device_m[devices]
+            tile = tile_of(point_m, ends_m, settings.radius_m, longest_m)
             pieces.append(LinkBatch(f"exchanged-{column:07d}-{digest}", point_m, ends_m,
                                     (scene.uav_antenna, scene.device_antennas[devices[0]]),
                                     settings.batch_receivers, tile))
@@ -523,11 +460,6 @@ def solve_exchanged(scene: Scene, settings: SolverSettings, store: BatchStore, i
     rows = [index.index(device) for devices in groups for device in devices]
     gain_db[rows] = np.concatenate([np.zeros(0), *solved]).reshape(len(columns), len(index)).T
     return columns, gain_db
-
-
-def _positions_per_altitude(scene: Scene) -> int:
-    """Return the number of lattice positions at one altitude."""
-    return len(scene.lattice.y_m) * len(scene.lattice.x_m)
 
 
 def lattice_pieces(scene: Scene, settings: SolverSettings, index: list[int],
@@ -542,5 +474,5 @@ def lattice_pieces(scene: Scene, settings: SolverSettings, index: list[int],
     label = label or ("batch" if settings.solver == "paths" else "altitude")
     devices = [(f"device-{device:03d}-{label}", scene.device_m[device],
                 scene.device_antennas[device]) for device in index]
-    size = None if settings.solver == "paths" else _positions_per_altitude(scene)
+    size = None if settings.solver == "paths" else scene.lattice.y_m.size * scene.lattice.x_m.size
     return link_pieces(scene, settings, devices, points_m, size)

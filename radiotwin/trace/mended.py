@@ -103,8 +103,7 @@ def mended(diffraction: str) -> Iterator[None]:
 def _lengths_m(self: Any, paths: Any, source: Any, target: Any) -> Any:
     """Return the lengths of paths after and before their diffraction [m]; replaces Sionna RT's.
 
-    The first counts from the edge to `target`, the second from `source` to the edge. Depths behind
-    a path's last interaction are skipped; without diffraction, all is before.
+    Depths behind a path's last interaction are skipped; without diffraction, all is before.
     """
     import drjit
     import mitsuba
@@ -131,15 +130,8 @@ def _wedge_matrix(self: Any, to_world: Any, direction_in: Any, direction: Any, s
     """Return the Jones matrix (4 x 4, real) of diffraction at a wedge; replaces Sionna RT's.
 
     The coefficient is that of [1] for a wedge of exterior angle n π, with the reflections of [2].
-
-    Args:
-        self: Material of both faces, a slab.
-        to_world: From the frame of face 0, whose normal is z.
-        direction_in: Of the ray before the edge, in that frame.
-        direction: Of the ray after it.
-        si: Holds the edge's direction, face n's normal and the lengths of the path [m].
-        permittivity: Complex relative permittivity of the material.
-        wave_number: In vacuum [1/m].
+    Directions are in the frame of face 0, whose normal is z; `si` holds the edge's direction, face
+    n's normal and the lengths of the path [m].
     """
     import drjit
     import mitsuba
@@ -201,9 +193,8 @@ def _wedge_matrix(self: Any, to_world: Any, direction_in: Any, direction: Any, s
 def _cotangent_term(beta: Any, x: Any, n: Any, sign: int) -> Any:
     """Return cot((π + sign β) / 2n) F(x a(β)), a term of the wedge's coefficient [1, eq. 26-29].
 
-    β [rad] is the difference or sum of the angles of incidence and diffraction, n π the wedge's
-    exterior angle, and F the transition function. The cotangent is infinite where F is 0 (shadow
-    boundaries): both are computed from the angle to the boundary, so that their product is finite.
+    The cotangent is infinite where F is 0 (shadow boundaries): both are computed from the angle to
+    the boundary, so that their product is finite.
     """
     import drjit
 

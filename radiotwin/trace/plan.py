@@ -222,10 +222,7 @@ def choose_quality(scene: Scene, points_m: np.ndarray, target_db: float,
 
 def _draw_calls(points_m: np.ndarray, index: Sequence[int], seed: int
                 ) -> list[tuple[int, np.ndarray]]:
-    """Draw the links on which qualities are compared: device and points (n, 3) of each solver call.
-
-    The same seed, number of points and devices give the same links.
-    """
+    """Draw the links on which qualities are compared: device and points (n, 3) of each call."""
     rng = np.random.default_rng([seed, len(points_m), *index])
     devices = np.resize(rng.permutation(index), _CALLS)
     count = min(_POINTS, len(points_m))

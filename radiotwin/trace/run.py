@@ -66,27 +66,13 @@ def free_space_gain_db(distance_m: np.ndarray, frequency_hz: float) -> np.ndarra
 def check_gains(gain_db: np.ndarray, los: np.ndarray, distance_m: np.ndarray, frequency_hz: float,
                 solver: str, combining: str, direct_dbi: np.ndarray | float = 0.0,
                 peak_dbi: np.ndarray | float = 0.0) -> dict[str, float]:
-    """Check traced gains against bounds by physics.
+    """Check traced gains (n,) [dB] against bounds by physics; return figures for the map.
 
-    With antennas, an LoS link is at least as strong as its direct path, and at most as if all paths
-    left and arrived at the antennas' peaks. The median of LoS links over free space must lie within
-    `MEDIAN_EXCESS_DB`, and hardly any link below `MIN_EXCESS_DB`.
-
-    Args:
-        gain_db: (n,) gains [dB]; NaN: no path.
-        los: (n,) bool, line of sight by the 3D map.
-        distance_m: (n,) distance of the ends [m].
-        frequency_hz: Frequency [Hz].
-        solver: `paths` or `map`.
-        combining: `power` or `coherent`.
-        direct_dbi: (n,) gain of both antennas along the straight line [dBi].
-        peak_dbi: (n,) sum of both antennas' peaks [dBi].
-
-    Returns:
-        Figures for the map's attributes.
-
-    Raises:
-        RunFailed: A gain above 0 dB, no path at all, or LoS links outside these bounds.
+    With antennas, an LoS link is at least as strong as its direct path (`direct_dbi`, both
+    antennas' gain along the straight line), and at most as if all paths left and arrived at the
+    antennas' peaks (`peak_dbi`, their sum). The median of LoS links over free space must lie within
+    `MEDIAN_EXCESS_DB`, and hardly any link below `MIN_EXCESS_DB`. RunFailed for a gain above 0 dB,
+    no path at all, or LoS links outside these bounds.
     """
     found = np.isfinite(gain_db)
     if not found.any():
@@ -125,9 +111,7 @@ def check_gains(gain_db: np.ndarray, los: np.ndarray, distance_m: np.ndarray, fr
 def noise_figures(gain_db: np.ndarray, finer_db: np.ndarray) -> dict[str, float | str]:
     """Compare gains with those from ten times the rays, both (n,) [dB] with NaN where not detected.
 
-    Returns:
-        Attributes of the map: RMS, median and 90th percentile of the difference over links detected
-        in both (NaN if there are none), and the share of links detected in only one.
+    Attributes of the map, over links detected in both; and the share of those detected in only one.
     """
     both = np.isfinite(gain_db) & np.isfinite(finer_db)
     difference_db = np.abs(gain_db - finer_db)[both] if both.any() else np.array([np.nan])
@@ -148,12 +132,9 @@ def exchange_figures(gain_db: np.ndarray, exchanged_db: np.ndarray, los: np.ndar
     """Compare gains with those traced from the other end of each link, both (n,) [dB].
 
     By reciprocity they are equal. A difference is an error of the traced map: paths that the rays
-    of one end miss, or diffraction that is not reciprocal. NaN is not detected.
-
-    Returns:
-        Attributes of the map, over links detected in both: RMS of the difference for LoS (`los`,
-        (n,) bool) and for NLoS links; for the latter also the mean of exchanged minus original
-        gain, and the share that differs by more than `DOUBT_DB`. NaN for a class without links.
+    of one end miss, or diffraction that is not reciprocal. NaN is not detected. Returns attributes
+    of the map: RMS difference for LoS and NLoS links; for the latter also the mean of exchanged
+    minus original gain, and the share that differs by more than `DOUBT_DB`.
     """
     both = np.isfinite(gain_db) & np.isfinite(exchanged_db)
     difference_db = exchanged_db - gain_db
@@ -306,11 +287,7 @@ def warn_of_terrain(city: CityMap, device_m: np.ndarray, positions_m: np.ndarray
 
 
 def _antenna_gains(scene: Scene, index: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the gain of both antennas along the straight line of each link, and their peaks.
-
-    Returns:
-        (devices, positions) gains of both ends together, and (devices, 1) peaks [dBi].
-    """
+    """Return both antennas' gain along each link's line (devices, positions), and peaks [dBi]."""
     link_m = scene.lattice.positions_m[None] - scene.device_m[index][:, None]
     direct_dbi, peak_dbi = np.zeros(link_m.shape[:2]), np.zeros((len(index), 1))
     for row, antenna in enumerate(scene.device_antennas[device] for device in index):
@@ -368,11 +345,7 @@ def open_store(scene: Scene, settings: SolverSettings) -> BatchStore:
 
 def _censor_gains(raw_db: np.ndarray, inside: np.ndarray, impossible: np.ndarray, limit_db: float
                   ) -> tuple[np.ndarray, dict[str, int]]:
-    """Set gains that are not detected to NaN, and count the links by reason.
-
-    A link is not detected without a path, below `limit_db`, or at a position inside a building
-    (`inside`, (positions,) bool). `raw_db` and `impossible` are (devices, positions).
-    """
+    """Set gains (devices, positions) not detected to NaN, and count the links by reason."""
     within = np.broadcast_to(inside, raw_db.shape)
     no_path = np.isnan(raw_db) & ~within & ~impossible
     below = ~within & (raw_db < limit_db)

@@ -61,13 +61,9 @@ def library_versions() -> dict[str, str]:
 def import_sionna(device: Device = "cpu") -> Any:
     """Import and return `sionna.rt` for the processor (`cpu`, by libLLVM) or a GPU (`cuda`).
 
-    A process cannot change from one to the other.
-
-    Mitsuba looks for plugins in the working directory first, which may be the folder of a
-    stranger's scene: it is restricted to the folder where it is installed.
-
-    Raises:
-        RunFailed: No usable libLLVM or GPU, or this process traces on another device already.
+    A process cannot change from one to the other. Mitsuba looks for plugins in the working
+    directory first, which may be the folder of a stranger's scene: it is restricted to the folder
+    where it is installed. RunFailed without a usable libLLVM or GPU, or on another device already.
     """
     if device == "cpu":
         llvm.prepare()
@@ -103,14 +99,9 @@ def _set_variant(mitsuba: Any, device: Device) -> None:
 def load_city(city: City, frequency_hz: float, device: Device = "cpu") -> Any:
     """Load a city into Sionna RT, with vertically polarised isotropic antennas at both ends.
 
-    The city is a `city.xml`, shapes, or None for empty space. Mitsuba's parser, which can load
-    other files and plugins, gets a copy written from the parsed shapes, not the scene's own file.
-    ITU materials outside their frequency range keep the constants at its nearest end, with a
-    warning.
-
-    Raises:
-        BadInput: The file cannot be read.
-        RunFailed: As `import_sionna`.
+    Mitsuba's parser, which can load other files and plugins, gets a copy written from the parsed
+    shapes, not the scene's own file. ITU materials outside their frequency range keep the constants
+    at its nearest end, with a warning. BadInput if the file cannot be read.
     """
     rt = import_sionna(device)
     scene = rt.load_scene(None) if city is None else _load_copy(rt, city)
@@ -184,22 +175,14 @@ def candidate_search(table_size: int, diffraction_probability: float) -> Iterato
 
 def distinct_paths(interactions: np.ndarray, vertices_m: np.ndarray, length_m: np.ndarray,
                    strength: np.ndarray, cos_turn: np.ndarray) -> np.ndarray:
-    """Return which paths of each link count, each distinct path once, as a mask.
+    """Return which paths of each link count (n, k), each distinct path once.
 
-    Paths are duplicates if they have the same interactions in the same order at the same points,
-    and the same length: the strongest counts. Paths of equal length over different points (two
-    walls at equal distances) both count. Of a link's direct paths the straightest counts.
-
-    Args:
-        interactions: (depth, n, k) types of interactions of k paths of n links, 0: none.
-        vertices_m: (depth, n, k, 3) points of interaction [m].
-        length_m: (n, k) length [m]; not positive where there is no path.
-        strength: (n, k) magnitude of the field.
-        cos_turn: (n, k) cosine of the angle between the directions of departure and of arrival,
-            -1 for a straight line, as a direct path has it unless Sionna RT failed to store it.
-
-    Returns:
-        (n, k) bool.
+    Paths are duplicates if they have the same interactions (depth, n, k), 0: none, in the same
+    order at the same points (depth, n, k, 3), and the same length: the strongest counts. Paths of
+    equal length over different points (two walls at equal distances) both count. There is no path
+    where the length (n, k) is not positive. Of a link's direct paths the straightest counts:
+    `cos_turn` (n, k), the cosine between the directions of departure and arrival, is -1 unless
+    Sionna RT failed to store it.
     """
     exists = length_m > 0
     used = interactions > 0
@@ -265,23 +248,13 @@ class PathGains:
 
     def solve(self, device_m: np.ndarray, points_m: np.ndarray, antennas: Antennas = (None, None)
               ) -> np.ndarray:
-        """Return the gains of one batch.
+        """Return the gains (n,) of one batch of points (n, 3) [dB]; NaN where there is no path.
 
         Rays are launched in all directions, and vertically polarised. Each path is then weighted
-        with the antennas' gains in its directions of departure and arrival.
-
+        with the antennas' gains (device, receivers) in its directions of departure and arrival.
         Duplicate paths count once. A path carries at most the power of free space over its own
         length between the antennas' peaks: a link whose gain exceeds the sum of these bounds is
-        solved again alone, with the next seed.
-
-        Args:
-            device_m: (3,) position [m].
-            points_m: (n, 3) positions [m], n at most `settings.batch_receivers`.
-            antennas: Antennas of the device and of the receivers; None: isotropic.
-
-        Returns:
-            (n,) gain [dB]; NaN where there is no path, `IMPOSSIBLE_DB` where the second solution
-            exceeds its bound, too.
+        solved again alone, with the next seed, and `IMPOSSIBLE_DB` if it still does.
         """
         seed = self.settings.seed
         gain_db = self._solve(device_m, points_m, antennas, seed)
@@ -326,9 +299,8 @@ class PathGains:
     def _combine(self, paths: Any, antennas: Antennas) -> tuple[np.ndarray, np.ndarray]:
         """Return received over transmitted power (batch_receivers,), and its upper bound.
 
-        Each distinct path is weighted with the antennas' gains; powers, or fields with their
-        phases, are added as the settings say. The bound takes every path as free space over its
-        length, at the antennas' peaks.
+        Powers of distinct paths, or fields with their phases, are added as the settings say. The
+        bound takes every path as free space over its length, at the antennas' peaks.
         """
         n = self.settings.batch_receivers
 
@@ -338,9 +310,13 @@ class PathGains:
         field = by_link(paths.a[0]) + 1j * by_link(paths.a[1])
         leaving, arriving = (_unit_vectors(by_link(zenith), by_link(azimuth)) for zenith, azimuth in
                              ((paths.theta_t, paths.phi_t), (paths.theta_r, paths.phi_r)))
-        counted = self._counted(paths, np.abs(field), np.sum(leaving * arriving, axis=-1))
         # Sionna's coefficients lack the phase of the delay, which is -1 where there is no path
         delay_s = by_link(paths.tau)
+        interactions = np.array(paths.interactions)
+        interactions = interactions.reshape(len(interactions), *field.shape)
+        vertices_m = np.array(paths.vertices).reshape(*interactions.shape, 3)
+        counted = distinct_paths(interactions, vertices_m, speed_of_light * delay_s, np.abs(field),
+                                 np.sum(leaving * arriving, axis=-1))
         field *= counted
         frequency_hz = float(self._city.frequency[0])
         limit = counted / (4 * np.pi * frequency_hz * np.where(counted, delay_s, 1.0))
@@ -353,14 +329,6 @@ class PathGains:
         field *= np.exp(-2j * np.pi * frequency_hz * delay_s)
         return (_exact_sums(field.real) ** 2 + _exact_sums(field.imag) ** 2,
                 _exact_sums(limit) ** 2)
-
-    def _counted(self, paths: Any, strength: np.ndarray, cos_turn: np.ndarray) -> np.ndarray:
-        """Return which of Sionna RT's paths are distinct, (links, paths) bool."""
-        interactions = np.array(paths.interactions)
-        interactions = interactions.reshape(len(interactions), *strength.shape)
-        vertices_m = np.array(paths.vertices).reshape(*interactions.shape, 3)
-        length_m = speed_of_light * np.array(paths.tau, dtype=float).reshape(strength.shape)
-        return distinct_paths(interactions, vertices_m, length_m, strength, cos_turn)
 
 
 class CellGains:

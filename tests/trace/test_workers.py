@@ -81,10 +81,10 @@ def test_a_command_that_was_killed_goes_on_with_other_workers_to_the_same_bytes(
 
 def test_a_batch_in_halves_differs_little_from_the_whole(small_scene):
     """What is done where memory is short: a gain depends on the points beside it in rare cases only."""
-    from radiotwin.trace.link_job import LinkBatch, SolvePaths
+    from radiotwin.trace.link_job import LinkBatch, SolveBatch
 
     piece = LinkBatch("a", small_scene.device_m[0], points_of(small_scene)[:40], (None, None), 40)
-    solve = SolvePaths(small_scene, SETTINGS)
+    solve = SolveBatch(small_scene, SETTINGS)
     whole = solve(piece)
     halves = np.concatenate([solve(half) for half in piece.halves()])
     assert [half.batch_receivers for half in piece.halves()] == [20, 20]

@@ -19,12 +19,7 @@ class Adam:
 
     def __init__(self, tensors: Sequence[torch.Tensor],
                  decay: Sequence[float] | None = None) -> None:
-        """Start at zero moments.
-
-        Args:
-            tensors: parameters to optimise.
-            decay: weight decay, one for each tensor; None: no decay.
-        """
+        """Start at zero moments; `decay` is the weight decay of each tensor, None: none."""
         self.tensors = list(tensors)
         self._decay = [0.0] * len(self.tensors) if decay is None else list(decay)
         self.mean = [torch.zeros_like(tensor) for tensor in self.tensors]
@@ -33,12 +28,7 @@ class Adam:
 
     @torch.no_grad()
     def step(self, gradients: Sequence[torch.Tensor], rate: float) -> None:
-        """Update the parameters in place by one step of Adam.
-
-        Args:
-            gradients: gradient of the loss, one for each of `tensors`.
-            rate: learning rate.
-        """
+        """Update the parameters in place by one step, from a gradient for each of `tensors`."""
         self.count += 1
         unbias_mean = 1.0 - (1.0 - MEAN_RATE) ** self.count
         unbias_square = 1.0 - (1.0 - SQUARE_RATE) ** self.count

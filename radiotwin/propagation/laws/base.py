@@ -141,16 +141,10 @@ class ChannelModel(ABC):
 
 
 def check_fit_data(links: LinkGeometry, level_db: np.ndarray, *, needs_los: bool) -> None:
-    """Raise BadInput if a channel cannot be learnt from these links.
+    """Raise BadInput unless MIN_DETECTED of the levels (n,) [dB] are detected (not NaN).
 
-    Args:
-        links: n links.
-        level_db: (n,) levels [dB]; NaN: not detected.
-        needs_los: require a detected link with line of sight, as models that use a map do: if
-            there is none, map and positions nearly always disagree.
-
-    Raises:
-        BadInput: fewer than MIN_DETECTED links are detected, or none of them has line of sight.
+    `needs_los`: require one with line of sight, as models that use a map do: if there is none, map
+    and positions nearly always disagree.
     """
     detected = np.isfinite(level_db)
     n = int(detected.sum())
@@ -174,16 +168,8 @@ def drop_uninformative(links: LinkGeometry, level_db: np.ndarray, limit_db: Limi
                        ) -> tuple[LinkGeometry, np.ndarray, np.ndarray]:
     """Drop links that were not detected and have no limit of detection; warn if there are any.
 
-    Args:
-        links: n links.
-        level_db: (n,) [dB]; NaN: not detected.
-        limit_db: limit of detection [dB], one for all or (n,); None or -inf: unknown.
-
-    Returns:
-        m links, their levels (m,), and their limits (m,) [dB].
-
-    Raises:
-        BadInput: too few links are detected, or a level is infinite.
+    Returns m links, their levels (m,), NaN: not detected, and their limits (m,) [dB]. BadInput if
+    too few links are detected, or a level is infinite.
     """
     level_db = np.asarray(level_db, float)
     if np.isinf(level_db).any():
@@ -213,13 +199,7 @@ def ground_blocks(links: LinkGeometry) -> np.ndarray:
 
 
 def require_names(what: str, given: Collection[str], expected: Collection[str]) -> None:
-    """Raise ValueError unless the given names are exactly the expected ones.
-
-    Args:
-        what: kind of the names, for the message.
-        given: names in a file.
-        expected: names that it must have.
-    """
+    """Raise ValueError unless the given names, of a kind `what`, are exactly the expected ones."""
     wrong = sorted(set(given) ^ set(expected))
     if wrong:
         state = "missing" if wrong[0] in expected else "unknown"

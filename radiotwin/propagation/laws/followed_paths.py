@@ -44,9 +44,7 @@ MIN_STEP_M = 1e-9  # a leg shorter than this along an axis counts as parallel to
 def path_gains(geometry: LinkGeometry, kinds: tuple[str, ...] | None = None) -> np.ndarray:
     """Return the summed power gain (n,) of the paths of links between isotropic antennas, linear.
 
-    Args:
-        geometry: n links over a map.
-        kinds: fields of `radiotwin.propagation.paths.PathPowers` to sum; None: all.
+    `kinds` are fields of `PathPowers`; None: all.
     """
     columns = [COMPONENTS.index(kind) for kind in (COMPONENTS if kinds is None else kinds)]
     power = np.zeros(len(geometry))
@@ -131,10 +129,7 @@ class Rays:
     def of(cls, links: Links, of_device: bool, straight: bool = False) -> "Rays":
         """Return the rays of links at their devices, or at their receivers.
 
-        Args:
-            links: n links.
-            of_device: True: at the devices; False: at the receivers.
-            straight: use one ray a link, along the straight line, as without a map.
+        `straight`: one ray a link, along the straight line, as without a map.
         """
         if straight or links.city is None:
             way_m = links.offset_m if of_device else -links.offset_m
@@ -165,10 +160,9 @@ class Rays:
                            mean_gain: float = 1.0) -> np.ndarray:
         """Return what an antenna adds to the levels (n,) [dB]; NaN for links without power.
 
-        Args:
-            gain: (p,) antenna gain in the directions of the rays, linear.
-            scattered_db: power scattered from all directions, relative to free space [dB].
-            mean_gain: antenna gain averaged over all directions, for the scattered power, linear.
+        `gain` (p,) is that in the directions of the rays, linear; `scattered_db` the power
+        scattered from all directions, relative to free space, with the mean gain over all
+        directions.
         """
         scattered = self.free_space * 10 ** (scattered_db / 10)
         received = self._sums(self.power * gain) + scattered * mean_gain
@@ -210,12 +204,7 @@ _remembered: OrderedDict[tuple[CityMap, _Position, float], _Followed] = OrderedD
 
 
 def _by_device(geometry: LinkGeometry) -> Iterator[tuple[np.ndarray, _Followed, np.ndarray]]:
-    """Yield the cached paths of the links, device by device.
-
-    Yields:
-        rows of the device's links in `geometry`, its cached paths, and the row of each of these
-        links in them.
-    """
+    """Yield rows of a device's links, its cached paths, and the rows of these links there."""
     city = geometry.city
     if city is None:
         raise BadInput("the model paths follows paths over a 3D map, and none is given; "
@@ -247,12 +236,7 @@ def followed_from_m(geometry: LinkGeometry, row: int) -> _Position:
 
 def _follow(city: CityMap, wanted: list[tuple[_Position, np.ndarray]],
             frequency_hz: float) -> list[tuple[_Followed, np.ndarray]]:
-    """Return the paths from positions to their receivers (n, 3) [m], cached or newly traced.
-
-    Returns:
-        for each wanted position its entry of the cache, and the row (n,) of each receiver in that
-        entry.
-    """
+    """Return for each position and its receivers (n, 3) [m] the cached paths, and rows (n,)."""
     nothing = _Followed(np.zeros(0, dtype=np.int64), np.zeros((0, len(COMPONENTS))),
                         _packed(NO_DIRECTIONS))
     keys = [_keys(ends_m) for _, ends_m in wanted]
@@ -284,11 +268,7 @@ def _follow(city: CityMap, wanted: list[tuple[_Position, np.ndarray]],
 
 def _new_paths(city: CityMap, asked: list[tuple[_Position, np.ndarray]],
                frequency_hz: float) -> list[_NewPaths]:
-    """Trace the paths from positions to receivers (n, 3), or read them from an earlier run.
-
-    Returns:
-        powers and paths for each position, see `_Followed`.
-    """
+    """Trace the paths from positions to receivers (n, 3), or read them from an earlier run."""
     if not asked:  # usually all paths are cached, and no progress bar is needed
         return []
 
@@ -390,12 +370,7 @@ class KnownPaths:
         self._paths: tuple[np.ndarray, ...] = ()  # link, power, points, number of points; (p, ...)
 
     def powers_with_box(self, box: UprightBox, rows: np.ndarray) -> Power:
-        """Return the power gains of links `rows` (r,) with and without the paths that a box blocks.
-
-        Args:
-            box: upright box, such as an unknown building.
-            rows: (r,) indices of links; paths that were not traced yet are traced first.
-        """
+        """Return the power gains of links `rows` (r,), traced if need be, past a box and in all."""
         self.follow(rows)
         if not self._paths:
             nothing = np.zeros(len(rows))
@@ -460,10 +435,7 @@ def _blocked(points_m: np.ndarray, count: np.ndarray, centre_m: tuple[float, flo
 @njit(cache=True, nogil=True, error_model="numpy")
 def _clip_leg(start_m: float, step_m: float, low_m: float, high_m: float, enter: float,
               leave: float) -> tuple[float, float]:
-    """Clip the interval (enter, leave) of a leg's parameter 0..1 to the slab between two planes.
-
-    `start_m` and `start_m + step_m` are the leg's ends across the slab; enter > leave: empty.
-    """
+    """Clip an interval (enter, leave) of a leg's parameter 0..1 to a slab; enter > leave: empty."""
     if abs(step_m) < MIN_STEP_M:
         return (enter, leave) if low_m <= start_m <= high_m else (1.0, 0.0)
     first, second = (low_m - start_m) / step_m, (high_m - start_m) / step_m

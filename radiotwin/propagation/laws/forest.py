@@ -101,17 +101,9 @@ class Forest:
     @classmethod
     def from_state(cls, arrays: dict[str, np.ndarray], settings: dict[str, Any],
                    width: int) -> Self:
-        """Restore a forest from its `state`, after checking it.
+        """Restore a forest over `width` feature columns from its `state`, after checking it.
 
-        Args:
-            arrays: arrays of `state`.
-            settings: settings of `state`.
-            width: number of feature columns p.
-
-        Raises:
-            BadInput: too many nodes.
-            ValueError: damaged, such as a cycle of nodes.
-            KeyError: an array is missing.
+        BadInput if there are too many nodes; ValueError or KeyError if it is damaged.
         """
         require_names("arrays", arrays, _ARRAYS)
         require_names("settings", settings, ["constant"])

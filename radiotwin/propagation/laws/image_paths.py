@@ -49,9 +49,7 @@ Offsets = tuple[float, float]
 def scale_db(class_scale_db: float | np.ndarray, square_db: np.ndarray) -> np.ndarray:
     """Return the Student-t error scale (n,) [dB] of links over a map with errors.
 
-    Args:
-        class_scale_db: error scale of the LoS or NLoS class over an exact map [dB].
-        square_db: (n,) mean square of the level changes that map errors cause [dB²].
+    `square_db` (n,) are the mean squares of the level changes that map errors cause [dB²].
     """
     return np.sqrt(class_scale_db**2 + square_db * (DOF - 2) / DOF)
 
@@ -60,16 +58,9 @@ def fit_class(level_db: np.ndarray, limits_db: np.ndarray, paths: np.ndarray,
               square_db: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
     """Fit level offset and error scale of LoS, or of NLoS, links by maximum likelihood.
 
-    Args:
-        level_db: (n,) measured levels [dB]; NaN: not detected.
-        limits_db: (n,) limits of detection [dB].
-        paths: (n,) levels computed from paths [dB].
-        square_db: (n,) mean square of the level changes that map errors cause [dB²].
-        start: result of an earlier fit to start from; None: the median offset.
-
-    Returns:
-        (2,) offset of measured from computed levels [dB], and natural logarithm of the error
-        scale over an exact map [dB].
+    Levels (n,) [dB], NaN: not detected, are compared with those of `paths` (n,); `square_db` (n,)
+    as in `scale_db`. Starts from the result of an earlier fit, or the median offset. Returns (2,)
+    the offset [dB], and the natural logarithm of the error scale over an exact map [dB].
     """
     if start is None:
         seen = np.isfinite(level_db)
@@ -103,14 +94,9 @@ class LinkFit:
             ) -> tuple[np.ndarray, np.ndarray]:
         """Fit level offset and error scale to the LoS and to the NLoS links; return the misfit.
 
-        Args:
-            los: (n,) bool, line of sight.
-            paths_db: (n,) levels computed from paths [dB].
-            square_db: (n,) mean square of the level changes that map errors cause [dB²]; None: 0.
-
-        Returns:
-            (n,) negative log-likelihood of each link [nats], and (n,) residuals over their scale, 0
-            for links that were not detected. Both are 0 in a class without a detected link.
+        `square_db` (n,) are mean squares of the level changes that map errors cause [dB²]. Returns
+        the negative log-likelihood (n,) of each link [nats], and residuals (n,) over their scale, 0
+        for links that were not detected. Both are 0 in a class without a detected link.
         """
         nll, z = np.zeros((2, len(self.level_db)))
         square_db = np.zeros(len(los)) if square_db is None else square_db
@@ -161,11 +147,7 @@ class ImagePaths(ChannelModel):
                     antenna_db: np.ndarray | float = 0.0) -> Self:
         """Fit gain and exponent of the diffuse power to the NLoS links; a level offset is free.
 
-        Args:
-            links: n links.
-            level_db: (n,) measured levels [dB]; NaN: not detected.
-            limit_db: limit of detection [dB], see `fit`.
-            antenna_db: (n,) what antennas add to the power of the paths [dB].
+        Arguments are those of `fit`; `antenna_db` (n,) is added to the power of the paths [dB].
         """
         nlos = links.select(~links.los)
         level_db = level_db[~links.los]
@@ -201,12 +183,7 @@ class ImagePaths(ChannelModel):
         return self.level_db(_seen_gains(links), links), self.law.predict(links)[1]
 
     def level_db(self, power: np.ndarray, links: LinkGeometry) -> np.ndarray:
-        """Return the mean level (n,) [dB] of links from path power (n,), linear, and diffuse power.
-
-        Args:
-            power: (n,) summed power gain of the paths, linear.
-            links: n links.
-        """
+        """Return the mean level (n,) [dB] of path power (n,), linear, and diffuse power."""
         return _with_diffuse_db(power, links.distance_m, *self.diffuse)
 
     @override
@@ -256,8 +233,7 @@ class ImagePaths(ChannelModel):
 def _seen_gains(links: LinkGeometry) -> np.ndarray:
     """Return the summed power gain (n,) of paths, linear; the direct path counts if `links.los`.
 
-    `links.los` may differ from the map: an effect adds or removes an obstacle, or paths start at
-    the rounded position. Then the direct path is dropped, or added with its free-space gain.
+    That may differ from the map: an effect adds an obstacle, or paths start at a rounded position.
     """
     gains = interaction_gains(links)
     differs = (gains[:, 0] > 0) != links.los
@@ -293,13 +269,7 @@ def _with_diffuse_db(power: np.ndarray, distance_m: np.ndarray, gain_db: float,
 
 def paths_db(links: LinkGeometry, diffuse: tuple[float, float], offsets_db: Offsets = (0.0, 0.0)
              ) -> np.ndarray:
-    """Return the level (n,) [dB] of links from their paths and diffuse power.
-
-    Args:
-        links: n links.
-        diffuse: diffuse power, see `ImagePaths`.
-        offsets_db: added to the level of reflected, and of diffracted, paths [dB].
-    """
+    """Return the level (n,) [dB] of links from their paths, with offsets, and diffuse power."""
     return _level_db(interaction_gains(links), links.distance_m, diffuse, offsets_db)
 
 
@@ -317,12 +287,6 @@ def fit_offsets(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
 
     Maximum a posteriori under a normal prior of `OFFSET_SD_DB`. The prior keeps both at 0 if the
     levels of LoS and NLoS, which are fitted too, explain the data as well.
-
-    Args:
-        links: n links.
-        level_db: (n,) measured levels [dB]; NaN: not detected.
-        limit_db: limit of detection [dB], see `ImagePaths.fit`.
-        diffuse: diffuse power, see `ImagePaths`.
     """
     fit, gains = LinkFit(level_db, limit_db), interaction_gains(links)
     distance_m = links.distance_m

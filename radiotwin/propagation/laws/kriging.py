@@ -6,8 +6,7 @@ The interpolation is a Gaussian process over positions, one field for each serie
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from scipy.linalg import cho_solve, cholesky, solve_triangular
@@ -47,8 +46,7 @@ _Solved = tuple[np.ndarray, np.ndarray]
 """Cholesky factor (p, p) of the covariance, and kriging weights (p,)."""
 
 
-@dataclass(frozen=True)
-class _Field:
+class _Field(NamedTuple):
     """Residuals of one series at p points.
 
     Attributes:
@@ -61,12 +59,11 @@ class _Field:
     position_m: np.ndarray
     residual: np.ndarray
     kind: np.ndarray
-    count: np.ndarray
+    count: np.ndarray  # type: ignore[assignment]  # hides an unused method of tuples
 
-    def select(self, rows: np.ndarray) -> Self:
+    def select(self, rows: np.ndarray) -> _Field:
         """Return the points of given indices."""
-        return type(self)(self.position_m[rows], self.residual[rows], self.kind[rows],
-                          self.count[rows])
+        return _Field(*(values[rows] for values in self))
 
 
 class ResidualField:
@@ -88,11 +85,9 @@ class ResidualField:
     """
 
     def __init__(self, max_pairs: float = MAX_PAIRS, is_local: bool = False) -> None:
-        """Make an empty field.
+        """Make an empty field of at most `max_pairs`, the sum of the series' squared sizes.
 
-        Args:
-            max_pairs: largest sum over series of the squared number of points.
-            is_local: beyond it, keep all points and use the nearest ones; False: merge points.
+        `is_local`: beyond it, keep all points and use the nearest ones; False: merge points.
         """
         self.max_pairs, self.is_local = max_pairs, is_local
         self.share, self.kind_share, self.length_m = 0.5, 0.0, 50.0
@@ -102,12 +97,8 @@ class ResidualField:
             kind: np.ndarray | None = None) -> Self:
         """Fit the correlation over distance, store the points, and return the field itself.
 
-        Args:
-            series: (n,) index of each point's series.
-            position_m: (n, 3) position [m].
-            residual: (n,) residual of unit variance.
-            seed: of the random points to which the correlation is fitted.
-            kind: (n,) index of the kind of measurement, such as the phone; None: all the same.
+        Residuals (n,) have unit variance; `series` (n,) and `kind` (n,), such as the phone (None:
+        all the same), are indices. `seed` draws the points to which the correlation is fitted.
         """
         rng = np.random.default_rng(seed)
         kind = np.zeros(len(series), dtype=int) if kind is None else kind
@@ -136,8 +127,7 @@ class ResidualField:
                kind: np.ndarray) -> dict[int, np.ndarray]:
         """Merge and store points, given as in `fit`, in `fields`; return the rows of each series.
 
-        Points within SAME_POINT_M are averaged. In a field that is not local, the cells grow until
-        no series has too many points.
+        In a field that is not local, the cells grow until no series has too many points.
         """
         rows_of_series = _rows_by_series(series)
         max_points = self._max_points(len(rows_of_series))
@@ -182,9 +172,7 @@ class ResidualField:
                  ) -> Iterator[tuple[_Solved, np.ndarray, np.ndarray]]:
         """Split points to predict, given as in `fit`, into batches; unknown series are left out.
 
-        Yields:
-            Cholesky factor and kriging weights of p stored points, rows (b,) to predict from them,
-            and the correlation (p, b) between both.
+        Yields the solution of p stored points, rows (b,) to predict, and the correlation (p, b).
         """
         kind = np.zeros(len(series), dtype=int) if kind is None else kind
         for number, series_rows in _rows_by_series(series).items():
@@ -200,9 +188,7 @@ class ResidualField:
                         ) -> Iterator[tuple[_Field, _Solved, np.ndarray]]:
         """Yield groups of rows to predict in a series, with the stored points that predict them.
 
-        Each time: stored points, their Cholesky factor and kriging weights, and the rows. All
-        stored points predict all rows; if there are too many, groups of neighbouring rows use their
-        nearest points.
+        If there are too many points, groups of neighbouring rows use their nearest ones.
         """
         field = self.fields[number]
         if number in self._solved or len(field.residual) <= LOCAL_POINTS:
@@ -226,12 +212,8 @@ class ResidualField:
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Return arrays by name, and settings that JSON can hold, for `from_state`."""
-        arrays = {}
-        for number, field in self.fields.items():
-            arrays[f"position_m/{number}"] = field.position_m
-            arrays[f"residual/{number}"] = field.residual
-            arrays[f"kind/{number}"] = field.kind
-            arrays[f"count/{number}"] = field.count
+        arrays = {f"{name}/{number}": values for number, field in self.fields.items()
+                  for name, values in field._asdict().items()}
         return arrays, {"devices": list(self.fields), "share": self.share,
                         "kind_share": self.kind_share, "length_m": self.length_m}
 
@@ -246,7 +228,7 @@ class ResidualField:
                 type(number) is not int or number < 0 for number in numbers):
             raise ValueError("devices are not distinct whole numbers")
         require_names("arrays", arrays, [f"{name}/{number}" for number in numbers
-                                         for name in ("position_m", "residual", "kind", "count")])
+                                         for name in _Field._fields])
         field.share = require_number(settings, "share", 0, 1)
         field.kind_share = require_number(settings, "kind_share", 0, 1 - field.share + 1e-9)
         field.length_m = require_number(settings, "length_m", MIN_LENGTH_M, MAX_POSITION_M)
@@ -268,10 +250,7 @@ class ResidualField:
         return correlation
 
     def _covariance(self, field: _Field, distance_m: np.ndarray) -> np.ndarray:
-        """Return the covariance (p, p) of stored points at distances (p, p) [m].
-
-        A point that is the mean of several measurements has that much less of the nugget.
-        """
+        """Return the covariance (p, p) of stored points; means of several have less nugget."""
         covariance = self._correlation(distance_m, field.kind, field.kind)
         nugget = (1 - self.share - self.kind_share) / field.count
         covariance.ravel()[::len(covariance) + 1] += nugget + 1e-8  # keeps it positive definite
@@ -366,8 +345,7 @@ def _random_points(field: _Field, rng: np.random.Generator) -> _Field:
 def _fixed_receivers_m(links: LinkGeometry) -> np.ndarray:
     """Return positions (k, 3) of fixed receivers [m] if devices move; (0, 3) if receivers move.
 
-    Devices move if, for the median link, the receiver's position heard more devices than there are
-    positions that heard the link's device.
+    Devices move if the median link's receiver heard more devices than places heard its device.
     """
     cells, place = np.unique(np.round(links.receiver_m / SAME_PLACE_M), axis=0,
                              return_inverse=True)
@@ -417,10 +395,7 @@ class RegressionKriging(ChannelModel):
 
     def _residual(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
                   ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Fit the log-distance law to links and compute their residuals, for `ResidualField.fit`.
-
-        Returns series (m,), positions (m, 3) [m] and residuals (m,) in standard deviations.
-        """
+        """Fit the law; return series (m,), positions (m, 3) [m] and standardised residuals (m,)."""
         links, level_db, limit_db = drop_uninformative(links, level_db, limit_db)
         self.law.fit(links, level_db, limit_db)
         mean_db, sd_db = self.law.predict(links)
@@ -429,8 +404,7 @@ class RegressionKriging(ChannelModel):
     def _ends(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
         """Return series (n,) and positions (n, 3) [m] of links, where residuals are interpolated.
 
-        These are device and receiver position. If devices move, they are the fixed receiver and the
-        device's position; other receivers share one series.
+        Device and receiver position or, if devices move, fixed receiver and the device's position.
         """
         if not len(self.fixed_m):
             return links.device, links.receiver_m

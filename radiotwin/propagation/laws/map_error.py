@@ -76,9 +76,7 @@ def _estimate_sizes(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
                     diffuse: tuple[float, float], offsets_db: Offsets, seed: int) -> _Sizes:
     """Estimate standard deviations of wall positions and roof heights by maximum likelihood.
 
-    Each tried pair adds to the error variance of a link the mean square change of its level over
-    random maps with such errors. `diffuse` and `offsets_db` are those of `paths_db`; `seed` is of
-    the maps.
+    Each tried pair adds to the error variance of a link its mean square change over random maps.
     """
     power, fit = (diffuse, offsets_db), LinkFit(level_db, limit_db)
     base_db = paths_db(links, *power)
@@ -124,12 +122,8 @@ def _mean_square_db(links: LinkGeometry, base_db: np.ndarray,
                     seed: int) -> np.ndarray:
     """Return the mean square level change (n,) [dB²] from a map to random wrong copies of it.
 
-    Args:
-        links: n links over the map.
-        base_db: (n,) levels over the given map [dB].
-        power: diffuse power and offsets, arguments of `paths_db`.
-        size_m: standard deviations of walls and of heights in the copies [m].
-        seed: of the copies.
+    `base_db` (n,) are the levels over the given map, `power` the arguments of `paths_db`, `size_m`
+    the standard deviations of walls and of heights in the copies.
     """
     city = links.city
     if city is None or not any(size_m):
@@ -154,13 +148,10 @@ def estimate_shift(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit, s
                    ) -> Shift:
     """Estimate the shift of a map from links between declared positions (maximum likelihood).
 
-    Arguments are those of `estimate_map_error`.
-
-    Returns:
-        shift east and north and 90 % radius [m]; zeros if there are too few links, or it is not
-        significant. Wrong walls look like a different shift around each device. So the shift found
-        without a device must raise that device's likelihood, tested over all devices, and explain
-        more than errors of walls do.
+    Returns shift east and north and 90 % radius [m]; zeros if there are too few links, or it is not
+    significant. Wrong walls look like a different shift around each device. So the shift found
+    without a device must raise that device's likelihood, tested over all devices, and explain more
+    than errors of walls do.
     """
     limits_db = limits_of(limit_db, len(links))
     known = np.isfinite(level_db) | np.isfinite(limits_db)
@@ -208,11 +199,7 @@ def _random_rows(known: np.ndarray, count: int, seed: int) -> np.ndarray:
 
 def _try_shifts(links: LinkGeometry, fit: LinkFit, diffuse: tuple[float, float]
                 ) -> dict[tuple[float, float], np.ndarray]:
-    """Try shifts on rings, then descend from the best one in steps.
-
-    Returns:
-        negative log-likelihood (n,) of each link [nats], by shift east and north [m]; (0, 0) first.
-    """
+    """Try shifts [m] on rings, then descend from the best; return the links' (n,) nll by shift."""
     tried: dict[tuple[float, float], np.ndarray] = {}
 
     def try_shift(east_m: float, north_m: float) -> None:
@@ -320,16 +307,10 @@ Found = tuple[MapError, tuple[float, float]]
 
 def estimate_map_error(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
                        seed: int) -> Found:
-    """Estimate the errors of a map from measured links by maximum likelihood.
+    """Estimate the errors of a map from links to devices of known positions, by maximum likelihood.
 
-    Args:
-        links: n links over a map, to devices whose positions are known.
-        level_db: (n,) measured levels [dB]; NaN: not detected.
-        limit_db: limit of detection [dB], one for all or (n,); None: unknown.
-        seed: of the random links and maps.
-
-    Returns:
-        the errors, zeros if there are too few links, and the diffuse power.
+    Levels are (n,) [dB], NaN: not detected; `seed` is of the random links and maps. Returns the
+    errors, zeros if there are too few links, and the diffuse power.
     """
     shift_m = estimate_shift(links, level_db, limit_db, seed)
     links = MapError(shift_m=shift_m).on_map(links)

@@ -131,8 +131,8 @@ class PathKriging(ChannelModel):
     def _over_maps(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
         """Return mean (n,) [dB] and variance (n,) [dB²] of path levels over maps that may be true.
 
-        These are the given map and copies with random errors of the estimated sizes. Without such
-        errors there are no copies, and the variance is 0.
+        These are the given map and, if it has errors, copies with random ones of the estimated
+        sizes.
         """
         power = self.diffuse, self.map_error.offsets_db
         levels_db = [paths_db(links, *power)]
@@ -168,8 +168,7 @@ class PathKriging(ChannelModel):
                          mean_db: np.ndarray, square_db: np.ndarray) -> np.ndarray:
         """Return the weights (2,) of traced paths against kriging, in NLoS and LoS, in 0..1.
 
-        They minimise the squared error on detected links in held-out squares of ground, which
-        neither interpolation has seen. `mean_db` and `square_db` are from `_over_maps`.
+        They minimise the squared error on detected links in held-out squares of ground.
         """
         square = np.floor(links.receiver_m[:, :2] / BLOCK_M)
         label = np.unique(square, axis=0, return_inverse=True)[1].reshape(-1)

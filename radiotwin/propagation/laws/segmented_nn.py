@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -35,7 +34,7 @@ if TYPE_CHECKING:  # an extra, which takes seconds to load
     import torch
 
 WEIGHTS = ("w1", "b1", "w2", "b2", "w3", "b3")  # names of the tensors, as stored
-INPUTS = 4  # see TrainingData.inputs
+INPUTS = 4  # see `SegmentedNN._inputs`
 MEMBERS = 8  # networks, each with an eighth of the links held out
 HIDDEN = 24  # units of each hidden layer
 LEARNING_RATE = 1e-2  # at the first step; a cosine lowers it to a fiftieth
@@ -48,26 +47,6 @@ TABLE = 129  # nodes on each axis of the table of residuals
 TRIM = 0.005  # quantile at both ends of the data beyond which the residual is held constant
 MAX_HIDDEN, MAX_WEIGHT, MAX_DECADES = 4096, 1e6, 20.0  # bounds of networks in a file
 MIN_SPAN = np.array([0.1, 10.0])  # least range that scales log-distance, height difference [m]
-
-
-@dataclass(frozen=True)
-class TrainingData:
-    """Inputs and targets of the networks for n links.
-
-    Attributes:
-        inputs: (n, INPUTS) of about unit range, see `SegmentedNN._inputs`.
-        target: (n,) residual over the standard deviation of its class; if `censored`, that of the
-            limit of detection.
-        censored: (n,) bool, the link was not detected.
-        los: (n,) bool, line of sight.
-        fold: (n,) index of the member that holds out the link.
-    """
-
-    inputs: np.ndarray
-    target: np.ndarray
-    censored: np.ndarray
-    los: np.ndarray
-    fold: np.ndarray
 
 
 def require_torch() -> Any:
@@ -94,14 +73,9 @@ def one_thread() -> Iterator[None]:
 
 
 def forward(weights: dict[str, torch.Tensor], inputs: torch.Tensor) -> torch.Tensor:
-    """Evaluate all networks: two tanh layers and a linear one.
+    """Evaluate all networks, two tanh layers and a linear one, at inputs (n, INPUTS).
 
-    Args:
-        weights: by the names in WEIGHTS.
-        inputs: (n, INPUTS).
-
-    Returns:
-        (MEMBERS, n) residual in standard deviations of the link's class.
+    Returns (MEMBERS, n) residual in standard deviations of the link's class.
     """
     import torch
 
@@ -127,26 +101,24 @@ def _start(generator: torch.Generator) -> dict[str, torch.Tensor]:
 
 
 @one_thread()
-def _train(data: TrainingData, seed: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Train all networks with early stopping, each at its least held-out loss.
+def _train(inputs: np.ndarray, target: np.ndarray, censored: np.ndarray, los: np.ndarray,
+           fold: np.ndarray, seed: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Train all networks with early stopping, each at its least held-out loss (censored Gaussian).
 
-    The loss is the negative log-likelihood of a censored Gaussian (Tobit). Each member learns a
-    standard deviation for LoS and one for NLoS. Equal data and seed give equal bits.
-
-    Returns:
-        weights by name, (MEMBERS, ...) each, and (n,) held-out output: for each link that of the
-        member that was not trained on it.
+    Targets (n,) are residuals over the standard deviation of their class; where `censored`, that of
+    the limit of detection. `fold` (n,) is the member that holds out a link. Each member learns a
+    standard deviation for LoS and one for NLoS. Returns weights by name, (MEMBERS, ...), and for
+    each link (n,) the output of the member that was not trained on it.
     """
     import torch
 
     from radiotwin.propagation.laws.adam import Adam
 
     generator = torch.Generator().manual_seed(seed)
-    inputs = torch.as_tensor(data.inputs, dtype=torch.float32)
-    target = torch.as_tensor(data.target, dtype=torch.float32)
-    censored, fold = torch.as_tensor(data.censored), torch.as_tensor(data.fold)
-    segment = torch.as_tensor(data.los.astype(np.int64))
-    held_out = fold[None, :] == torch.arange(MEMBERS)[:, None]
+    x, y = (torch.as_tensor(values, dtype=torch.float32) for values in (inputs, target))
+    blank, member = torch.as_tensor(censored), torch.as_tensor(fold)
+    segment = torch.as_tensor(los.astype(np.int64))
+    held_out = member[None, :] == torch.arange(MEMBERS)[:, None]
     held_out_count = held_out.sum(1).clamp(min=1)
 
     weights, log_sd = _start(generator), torch.zeros(MEMBERS, 2)
@@ -159,8 +131,8 @@ def _train(data: TrainingData, seed: int) -> tuple[dict[str, np.ndarray], np.nda
     order, start = torch.empty(0, dtype=torch.int64), 0
 
     def loss_of(rows: torch.Tensor | slice) -> torch.Tensor:
-        output = forward(weights, inputs[rows])
-        return gaussian_nll_torch(target[rows], output, log_sd[:, segment[rows]], censored[rows])
+        output = forward(weights, x[rows])
+        return gaussian_nll_torch(y[rows], output, log_sd[:, segment[rows]], blank[rows])
 
     with progress("training the channel", total=STEPS) as advance:
         for step in range(STEPS + 1):
@@ -176,7 +148,7 @@ def _train(data: TrainingData, seed: int) -> tuple[dict[str, np.ndarray], np.nda
             if step == STEPS or step - last_better >= PATIENCE:
                 break
             if start + BATCH > len(order):
-                order, start = torch.randperm(len(target), generator=generator), 0
+                order, start = torch.randperm(len(y), generator=generator), 0
             rows = order[start : start + BATCH]
             start += BATCH
             loss = torch.where(held_out[:, rows], 0.0, loss_of(rows)).mean(1).sum()
@@ -184,7 +156,7 @@ def _train(data: TrainingData, seed: int) -> tuple[dict[str, np.ndarray], np.nda
             optimiser.step(torch.autograd.grad(loss, learnt), rate)
             advance(1)
     with torch.no_grad():
-        unseen = forward(best, inputs)[fold, torch.arange(len(target))]
+        unseen = forward(best, x)[member, torch.arange(len(y))]
     return {name: tensor.numpy() for name, tensor in best.items()}, unseen.numpy().astype(float)
 
 
@@ -238,14 +210,10 @@ class SegmentedNN(ChannelModel):
             self.low[s], self.high[s] = np.quantile(source, [TRIM, 1.0 - TRIM], axis=0)
         censored = np.isnan(level_db)
         residual = (np.where(censored, limit_db, level_db) - law_db) / law_sd_db
-        data = TrainingData(
-            inputs=self._inputs(coordinates, segment)[use],
-            target=residual[use],
-            censored=censored[use],
-            los=links.los[use],
-            fold=_folds(links, np.random.default_rng(seed))[use],
-        )
-        self.weights, heldout = _train(data, seed)
+        # Links of a block stay together: early stopping on single links would overfit.
+        fold = deal_groups(ground_blocks(links), MEMBERS, np.random.default_rng(seed))
+        self.weights, heldout = _train(self._inputs(coordinates, segment)[use], residual[use],
+                                       censored[use], links.los[use], fold[use], seed)
         mean_db = law_db.copy()
         mean_db[use] += heldout * law_sd_db[use]
         for s, line in enumerate((self.law.nlos, self.law.los)):
@@ -346,17 +314,5 @@ def _weights(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _coordinates(links: LinkGeometry) -> np.ndarray:
-    """Return log10 of the distance [m], and the receiver's height above the device [m]; (n, 2).
-
-    With a few flight altitudes, data fill a box in these coordinates, but not with elevation.
-    """
+    """Return log10 of the distance [m], and the receiver's height above the device [m]; (n, 2)."""
     return np.column_stack([links.log_distance, links.receiver_m[:, 2] - links.device_m[:, 2]])
-
-
-def _folds(links: LinkGeometry, rng: np.random.Generator) -> np.ndarray:
-    """Return the index (n,) of the network that each link tests, and does not train.
-
-    Links of a block, one device and a square of ground, stay together: their errors are alike, and
-    early stopping on single links would overfit.
-    """
-    return deal_groups(ground_blocks(links), MEMBERS, rng)

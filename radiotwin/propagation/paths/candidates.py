@@ -78,10 +78,9 @@ class PathsToEdges(NamedTuple):
 
 def _open_paths_to_edges(city: CityMap, surfaces: Surfaces, before: np.ndarray, edge: np.ndarray,
                          device_m: np.ndarray) -> PathsToEdges:
-    """Select the partial paths from the device (3,) [m] to edges that no obstacle blocks.
+    """Select the open ways from the device (3,) [m] by facets `before` (w, a) to edges (w,).
 
-    A partial path reflects at the facets in a row of `before` (w, a) and ends on the edge in `edge`
-    (w,). It is open if any of the points sampled on the lit part of the edge is visible that way.
+    A way is open if any of the points sampled on the lit part of the edge is visible that way.
     """
     lit_m, source_m, samples = _lit_parts(surfaces, before, edge, device_m)
     points = PathBuffer.allocate(SAMPLE_CHUNK + int(samples.max(initial=0)))
@@ -101,11 +100,9 @@ def _open_paths_to_edges(city: CityMap, surfaces: Surfaces, before: np.ndarray, 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _lit_parts(surfaces: Surfaces, before: np.ndarray, edge: np.ndarray, device_m: np.ndarray
                ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the part of each edge that the device can light by its reflections (w, 2) [m].
+    """Return the part of each edge that the device can light (w, 2) [m], and the source (w, 2) [m].
 
-    Also the position and distance of the device's image along and from the edge (w, 2) [m], and the
-    number of points to sample on the lit part (w,). All are 0 if nothing is lit. See
-    `PathsToEdges`.
+    Both as in `PathsToEdges`; and the number of points to sample (w,). All are 0 if nothing is lit.
     """
     image = np.empty((MAX_INTERACTIONS + 1, 3))
     lit_m, source_m = np.zeros((len(edge), 2)), np.zeros((len(edge), 2))
@@ -134,12 +131,10 @@ def _sample_edges(surfaces: Surfaces, before: np.ndarray, edge: np.ndarray, devi
                   points: PathBuffer) -> tuple[int, int]:
     """Fill a buffer with paths from the device, by reflections, to sampled points of edges.
 
-    A way is a row of `before` and `edge`: facets that reflect, then an edge. Of its `samples`,
-    every `SAMPLE_STEP`-th is tried from number `first` on, just off the edge. Ways in `is_seen` are
-    skipped. Begins at row `way`, and stops when `SAMPLE_CHUNK` paths are found.
-
-    Returns:
-        The number of paths, and the way with which to continue.
+    A way is a row of `before` and `edge`. Of its `samples`, every `SAMPLE_STEP`-th is tried from
+    number `first` on, just off the edge; ways in `is_seen` are skipped. Begins at row `way`, and
+    stops when `SAMPLE_CHUNK` paths are found. Returns their number, and the way with which to
+    continue.
     """
     edges = surfaces.edges
     image = np.empty((MAX_INTERACTIONS + 1, 3))
@@ -179,19 +174,10 @@ def _sample_edges(surfaces: Surfaces, before: np.ndarray, edge: np.ndarray, devi
 def _with_facets_after(surfaces: Surfaces, ways: PathsToEdges, first: np.ndarray, end: np.ndarray,
                        after: np.ndarray, parent: np.ndarray, depth: int
                        ) -> tuple[np.ndarray, np.ndarray]:
-    """Combine each partial path to an edge with the facet sequences that rays reach after it.
+    """Combine partial paths to edges with the sequences `after` (m, b) that rays hit behind them.
 
-    Args:
-        surfaces: facets and edges.
-        ways: partial paths from the device, by reflections, to edges.
-        first: (e,) first row of each edge in `after`: the empty sequence.
-        end: (e,) row after the last one of each edge.
-        after: (m, b) facets after an edge; then -1.
-        parent: (m,) earlier row of the sequence without its last facet.
-        depth: maximum number of interactions.
-
-    Returns:
-        (c,) rows of the ways, and (c,) rows of `after`.
+    `first` and `end` (e,) delimit an edge's rows in `after`, the empty sequence first; `parent`
+    (m,) is the row without the last facet. Returns rows (c,) of the ways, and of `after`.
     """
     max_rows = total = 0
     for way in range(len(ways.edge)):
@@ -259,8 +245,7 @@ class FacetSequences:
 def _sphere(count: int) -> np.ndarray:
     """Return (count, 3) unit vectors of a Fibonacci lattice (Gonzalez, Math. Geosci. 42, 2010).
 
-    Compared with a uniform density, they are three times as dense at the horizon, where a city's
-    distant facets look small, and a third as dense overhead.
+    Three times as dense as a uniform one at the horizon, where distant facets look small.
     """
     z = LEVEL_SINE * np.sinh((1 - (2 * np.arange(count) + 1) / count) * np.arcsinh(1 / LEVEL_SINE))
     angle = np.pi * (3 - np.sqrt(5)) * np.arange(count)
@@ -274,8 +259,7 @@ def _edge_sequences(city: CityMap, facets: CityFacets, rows: np.ndarray, depth: 
                     ) -> FacetSequences:
     """Shoot rays from edges `rows` (n,), and record the sequences of facets that they hit.
 
-    EDGE_RAYS rays start from each 20 m of an edge, at most 10 times as many, with starts spread
-    along it; each is followed over up to `depth` reflections.
+    EDGE_RAYS rays start from each 20 m of an edge, at most 10 times as many, spread along it.
     """
     edges, ends_m = facets.surfaces.edges[rows], facets.edge_ends_m[rows]
     normal_0, normal_n = edges[:, NORMAL_0:NORMAL_0 + 3], edges[:, NORMAL_N:NORMAL_N + 3]
@@ -295,17 +279,9 @@ def _edge_sequences(city: CityMap, facets: CityFacets, rows: np.ndarray, depth: 
 
 def _shoot(city: CityMap, facets: CityFacets, start_m: np.ndarray, direction: np.ndarray,
            source: np.ndarray, sources: int, depth: int, beyond: bool = True) -> FacetSequences:
-    """Trace rays over up to `depth` reflections, and return the sequences of facets they hit.
+    """Trace rays (n,) over up to `depth` reflections; return the sequences of facets they hit.
 
-    Args:
-        city: 3D map.
-        facets: facets of the map.
-        start_m: (n, 3) start of each ray [m].
-        direction: (n, 3) unit vector of each ray.
-        source: (n,) source of each ray.
-        sources: number of sources.
-        depth: maximum number of reflections.
-        beyond: also record the facet hit after the last reflection in `next_facets`.
+    `beyond`: also record the facet hit after the last reflection in `next_facets`.
     """
     normal = facets.surfaces.planes[:, NORMAL:NORMAL + 3]
     row = source  # row of the sequence that each ray has visited
@@ -347,8 +323,7 @@ def _first_facets(city: CityMap, facets: CityFacets, start_m: np.ndarray, direct
                   ) -> np.ndarray:
     """Return distance [m] and index of the first facet that each ray hits, as (2, n).
 
-    The index is -1 if a ray hits nothing, or the back of a facet. Flat ground is the last facet, a
-    plane without edges.
+    The index is -1 for none, or the back of one. Flat ground is the last facet, without edges.
     """
     distance_m, face, cosine = city.first_hits_towards(start_m, direction)
     facet = np.where(face >= 0, facets.of_face[face], -1)
@@ -402,14 +377,9 @@ class CandidateSearch:
             facet[order], np.arange(len(self.is_ground) + 1)))
 
     def candidates(self, device_m: np.ndarray, rays: int = DEVICE_RAYS) -> Candidates:
-        """Find sequences of reflections, and at most one diffraction, that paths may take.
+        """Find sequences of reflections, and at most one diffraction, of paths from (3,) [m].
 
-        Args:
-            device_m: (3,) position [m].
-            rays: number of rays shot.
-
-        Returns:
-            the candidates, those without an edge first.
+        Those without an edge come first.
         """
         key = np.asarray(device_m, dtype=float).tobytes(), rays
         with self._lock:
@@ -468,8 +438,7 @@ class CandidateSearch:
     def _corner_sequences(self, facing: np.ndarray) -> np.ndarray:
         """List reflections (n, depth) in corners, at a facet of `facing` (f,) and its neighbour.
 
-        Both facets meet in a reentrant corner, which reflects rays back to the device. From far
-        away, the strips that do so are too narrow to be hit by the rays that are shot.
+        From far away, the strips that reflect rays back are too narrow to be hit by the rays shot.
         """
         corners = self.facets.corners
         found = corners[np.isin(corners[:, 0], facing)] if self._depth > 1 else corners[:0]
@@ -479,10 +448,7 @@ class CandidateSearch:
 
     def _to_edges(self, sequences: FacetSequences, facing: np.ndarray
                   ) -> tuple[np.ndarray, np.ndarray]:
-        """List partial paths, facets (n, depth) and edge (n,), to the edges of all facets hit.
-
-        Includes direct paths to the edges of the facets in `facing` (f,), which face the device.
-        """
+        """List ways, facets (n, depth) and edge (n,), to the edges of facets hit, or `facing`."""
         direct = np.column_stack([np.zeros(len(facing), dtype=int), facing])
         reflected = sequences.next_facets[sequences.next_facets[:, 0] > 0]
         pairs = np.concatenate([direct, reflected])

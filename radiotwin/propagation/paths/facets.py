@@ -68,10 +68,9 @@ class Topology:
 
 
 def _topology(city: CityMap) -> Topology:
-    """Weld the corners of a city, and find the segments that its triangles share.
+    """Weld the corners of a city, split sides at corners on them, and find the shared segments.
 
-    Sides are split where the corner of another triangle lies on them. Slivers, and faces on flat
-    ground (within 5 cm of z = 0), are left out.
+    Slivers, and faces on flat ground (within 5 cm of z = 0), are left out.
     """
     if not np.isfinite(city.vertices).all():
         raise BadInput("the city has corners that are not finite numbers [m]; repair its meshes")
@@ -94,10 +93,7 @@ def _topology(city: CityMap) -> Topology:
 
 
 def _weld(vertices_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Merge vertices (v, 3) [m] closer than `WELD_M` into their mean.
-
-    Returns the merged vertices [m], and the row (v,) of each given vertex among them.
-    """
+    """Merge vertices (v, 3) [m] within `WELD_M` into their means, with new rows (v,)."""
     exact, index = np.unique(vertices_m, axis=0, return_inverse=True)
     pairs = cKDTree(exact).query_pairs(WELD_M, output_type="ndarray")
     graph = coo_matrix((np.ones(len(pairs)), pairs.T.reshape(2, -1)), shape=(len(exact),) * 2)
@@ -145,13 +141,9 @@ def _split(vertices_m: np.ndarray, sides: np.ndarray) -> tuple[np.ndarray, np.nd
 
 def _rows_of_sides(pieces: np.ndarray, side_of_piece: np.ndarray, side_of_row: np.ndarray,
                    side_count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return a row for each piece of each triangle's sides: corners (s, 2) and triangle (s,).
+    """Return corners (s, 2) and triangle (s,) of each piece of each triangle's sides.
 
-    Args:
-        pieces: (p, 2) corners of the pieces of distinct sides, side after side.
-        side_of_piece: (p,) distinct side of each piece.
-        side_of_row: (3 t,) distinct side of the three sides of each triangle.
-        side_count: number of distinct sides.
+    Pieces (p, 2) are in the order of distinct sides; `side_of_row` (3 t,) are those of triangles.
     """
     count = np.bincount(side_of_piece, minlength=side_count)
     first = np.cumsum(count) - count
@@ -209,11 +201,7 @@ def extract_facets(city: CityMap) -> CityFacets:
 
 
 def _facets(city: CityMap, topology: Topology) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Merge triangles to plane facets; return them as arrays of `Surfaces`.
-
-    Returns:
-        `planes` (f, 19), `triangle_uv_m` (t, 6), and the facet of each face of the city; -1: none.
-    """
+    """Return `planes` (f, 19), `triangle_uv_m` (t, 6), and each city face's facet; -1: none."""
     material = city.material[topology.source]
     if city.terrain is not None:
         material = np.where(city.terrain[topology.source], GROUND_MATERIAL, material)
@@ -258,17 +246,11 @@ def _coplanar_groups(topology: Topology, material: np.ndarray) -> np.ndarray:
 
 @njit(cache=True)
 def _frames(corners_m: np.ndarray, outward: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """Compute the plane of each facet and its smallest bounding rectangle.
+    """Compute the plane of each facet and its smallest rectangle along a side of `TRIED_SIDES`.
 
-    Rectangles are tried along the `TRIED_SIDES` longest sides of a facet's triangles.
-
-    Args:
-        corners_m: (t, 3, 3) triangles, facet after facet [m].
-        outward: (t, 3) outward normals of the triangles, twice as long as their areas [m²].
-        first: (f + 1,) first triangle of each facet.
-
-    Returns:
-        (f, 15) normal, origin [m], axes u and v, size [m], and 1 if the facet fills the rectangle.
+    Triangles (t, 3, 3) [m] and normals `outward` (t, 3), twice as long as areas [m²], are in the
+    order of facets, which begin at `first` (f + 1,). Returns (f, 15): normal, origin [m], axes u
+    and v, size [m], and 1 if the facet fills the rectangle.
     """
     out = np.empty((len(first) - 1, 15))
     for facet in range(len(first) - 1):
@@ -311,9 +293,7 @@ def _edges(planes: np.ndarray, of_face: np.ndarray, topology: Topology
            ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Find the convex edges between facets of one material, at which rays are diffracted.
 
-    Returns:
-        `Surfaces.edges` (e, 19), both ends of each (e, 2, 3) [m], and its two facets (e, 2),
-        ascending.
+    Returns `Surfaces.edges` (e, 19), their ends (e, 2, 3) [m], and two facets (e, 2), ascending.
     """
     if not len(planes):
         return np.empty((0, 19)), np.empty((0, 2, 3)), np.empty((0, 2), dtype=int)
@@ -346,10 +326,7 @@ def _tangent(direction: np.ndarray, normal: np.ndarray, other_normal: np.ndarray
 
 
 def _join(ends_m: np.ndarray, pair: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Join touching pieces of edge (p, 2, 3) [m] if both lie between the same two facets (p, 2).
-
-    Returns ends (e, 2, 3) [m] and facets (e, 2) of the joined edges.
-    """
+    """Join touching pieces of edge (p, 2, 3) [m] if both lie between the same two facets (p, 2)."""
     order = np.lexsort((pair[:, 1], pair[:, 0]))
     ends_m, pair = ends_m[order], pair[order]
     is_new = np.append(True, (pair[1:] != pair[:-1]).any(axis=1))[:len(pair)]
@@ -360,10 +337,7 @@ def _join(ends_m: np.ndarray, pair: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 @njit(cache=True)
 def _joined(ends_m: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Join collinear pieces (p, 2, 3) [m] that touch, within groups that begin at rows `first`.
-
-    Returns ends (e, 2, 3) [m] of the joined pieces, and the first row (e,) of the group of each.
-    """
+    """Join collinear pieces (p, 2, 3) [m] that touch; return ends, and first row of each group."""
     out_m, row = np.empty_like(ends_m), np.empty(len(ends_m), dtype=np.int64)
     count = 0
     for g in range(len(first) - 1):
@@ -401,9 +375,7 @@ def _open_sectors(vertices_m: np.ndarray, triangles: np.ndarray, normal: np.ndar
                   max_rad: float) -> np.ndarray:
     """Find where the open space between two triangles at one segment has an angle in a range.
 
-    Triangles at each segment are sorted by angle around it. Returns (w, 3): first row of the
-    segment, and the triangles at both sides of the open space. Arguments are attributes of
-    `Topology`.
+    Returns (w, 3): first row of the segment, and the triangles at both sides of the open space.
     """
     found = []
     for g in range(len(group) - 1):

@@ -16,18 +16,9 @@ from radiotwin.runtime.compiled import njit
 @njit(cache=True, nogil=True, error_model="numpy")
 def buffer_gains(surfaces: Surfaces, candidates: Candidates, wave_number: float, slabs: Slabs,
                  buffer: PathBuffer, rows: np.ndarray) -> np.ndarray:
-    """Compute the power gains of paths in a buffer, for vertically polarised isotropic antennas.
+    """Compute the power gains (m,), linear, of paths in rows (m,) of a buffer.
 
-    Args:
-        surfaces: facets and edges of the map.
-        candidates: interactions of the paths.
-        wave_number: 2 π / wavelength [1/m].
-        slabs: materials of the map.
-        buffer: the paths.
-        rows: (m,) rows of the buffer.
-
-    Returns:
-        (m,) power gain, linear.
+    Between vertically polarised isotropic antennas; the wave number is 2 π / wavelength [1/m].
     """
     gain = np.empty(len(rows))
     legs, field = np.empty((MAX_INTERACTIONS + 1, 4)), np.empty(3, dtype=np.complex128)
@@ -41,11 +32,10 @@ def buffer_gains(surfaces: Surfaces, candidates: Candidates, wave_number: float,
 @njit(cache=True, nogil=True, error_model="numpy")
 def buffer_amplitudes(surfaces: Surfaces, candidates: Candidates, wave_number: float, slabs: Slabs,
                       buffer: PathBuffer, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the complex gains and lengths of paths in a buffer; arguments as in `buffer_gains`.
+    """Compute the complex gains (m,) and lengths (m,) [m] of paths; arguments as in `buffer_gains`.
 
-    Returns:
-        (m,) received over transmitted field, with the phase of the delay, for fields that vary as
-        exp(+j ω t); its squared magnitude is the power gain. And (m,) lengths of the paths [m].
+    Received over transmitted field, with the phase of the delay, for fields that vary as exp(+j ω
+    t); its squared magnitude is the power gain.
     """
     amplitude, total_m = np.empty(len(rows), dtype=np.complex128), np.empty(len(rows))
     legs, field = np.empty((MAX_INTERACTIONS + 1, 4)), np.empty(3, dtype=np.complex128)
@@ -63,10 +53,8 @@ def _received_field(surfaces: Surfaces, candidates: Candidates, wave_number: flo
                     ) -> tuple[complex, float, float]:
     """Compute the field of one path at the receiver by reflecting and diffracting it on the way.
 
-    Overwrites `legs`, directions and lengths of up to MAX_INTERACTIONS + 1 legs, and `field` (3,).
-
-    Returns:
-        The received field, the spreading factor of its power [1/m²], and the length [m].
+    Overwrites `legs` and `field`. Returns the received field, the spreading factor of its power
+    [1/m²], and the length [m].
     """
     planes, row, count = surfaces.planes, buffer.candidate[path], buffer.count[path] - 1
     direction, length_m = legs[:count, :3], legs[:count, 3]

@@ -76,6 +76,17 @@ class PathBuffer(NamedTuple):
         receiver, candidate, count = np.empty((3, capacity), dtype=np.int64)
         return cls(receiver, candidate, np.zeros((capacity, MAX_INTERACTIONS + 2, 3)), count)
 
+    def end_legs_m(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the first legs (m, 3) from the device, and the last ones from the receiver [m]."""
+        points_m, last, path = self.points_m[rows], self.count[rows] - 1, np.arange(len(rows))
+        return (points_m[:, 1] - points_m[:, 0],
+                points_m[path, last - 1] - points_m[path, last])
+
+
+def unit_vectors(leg_m: np.ndarray) -> np.ndarray:
+    """Return the unit vectors (n, 3) of legs (n, 3) [m]; 0 for a leg without length."""
+    return leg_m / np.maximum(np.linalg.norm(leg_m, axis=1, keepdims=True), 1e-9)
+
 
 @njit(cache=True, error_model="numpy")
 def sequence_length(facets: np.ndarray, row: int) -> int:
@@ -89,18 +100,10 @@ def sequence_length(facets: np.ndarray, row: int) -> int:
 @njit(cache=True, nogil=True, error_model="numpy")
 def find_paths(surfaces: Surfaces, candidates: Candidates, device_m: np.ndarray,
                receiver_m: np.ndarray, cursor: int, buffer: PathBuffer) -> tuple[int, int]:
-    """Find paths for all candidates and receivers in order, until the buffer is full.
+    """Find paths for all candidates and receivers (n, 3) [m] in order, until the buffer is full.
 
-    Args:
-        surfaces: facets and edges.
-        candidates: sequences of interactions to try.
-        device_m: (3,) position [m].
-        receiver_m: (n, 3) positions [m].
-        cursor: candidate · n + receiver at which to begin.
-        buffer: filled from its first row on.
-
-    Returns:
-        The number of paths found, and the cursor at which to continue.
+    Begins at `cursor`, candidate · n + receiver, and fills the buffer from its first row on.
+    Returns the number of paths found, and the cursor at which to continue.
     """
     planes, uv_m, edges = surfaces.planes, surfaces.triangle_uv_m, surfaces.edges
     n = len(receiver_m)
@@ -231,12 +234,8 @@ def _from_edge(planes: np.ndarray, uv_m: np.ndarray, edges: np.ndarray, edge: in
                ) -> tuple[bool, float, float, float]:
     """Find the points of a path from its diffraction at an edge to the receiver x, y, z [m].
 
-    Writes the diffraction point and the reflection points after it into `points_m[first:]`, and
-    overwrites `mirror`. `along_m` and `across_m` are the position of the device's image along the
-    edge and its distance from it.
-
-    Returns:
-        False if there is no such path, and the point on the edge [m].
+    Writes them into `points_m[first:]`, and overwrites `mirror`. `along_m` and `across_m` are those
+    of the device's image. Returns False if there is no such path, and the point on the edge [m].
     """
     for k in range(len(facets) - 1, -1, -1):  # mirror[k]: receiver mirrored in facets[k:]
         if height(planes, facets[k], x, y, z) < ON_PLANE_M:

@@ -90,14 +90,9 @@ def slabs_of(materials: Sequence[Material], frequency_hz: float) -> Slabs:
 
 @njit(cache=True)
 def fresnel(sine: float, permittivity: complex) -> tuple[complex, complex]:
-    """Return the Fresnel reflection coefficients of a half space [4].
+    """Return the Fresnel reflection coefficients TE and TM of a half space [4].
 
-    Args:
-        sine: sine of the angle between ray and surface.
-        permittivity: complex relative permittivity of the half space.
-
-    Returns:
-        The coefficients TE and TM, which tend to -1 and +1 for a perfect conductor.
+    They tend to -1 and +1 for a perfect conductor. `sine` is of the angle between ray and surface.
     """
     root = np.sqrt(permittivity - (1.0 - sine * sine) + 0j)
     te = (sine - root) / (sine + root)
@@ -108,13 +103,8 @@ def fresnel(sine: float, permittivity: complex) -> tuple[complex, complex]:
 def reflection(sine: float, slabs: Slabs, row: int) -> tuple[complex, complex]:
     """Return the reflection coefficients of a slab in air [1, eq. 43a, 44] or of a half space.
 
-    Args:
-        sine: sine of the angle between ray and surface.
-        slabs: materials.
-        row: row of the material in `slabs`.
-
-    Returns:
-        The coefficients TE and TM of the specular field, with the signs of `fresnel`.
+    TE and TM of the specular field, with the signs of `fresnel`; `row` is the material's in
+    `slabs`.
     """
     sine = max(sine, MIN_SINE)
     permittivity = slabs.permittivity[row]
@@ -164,19 +154,11 @@ def wedge_coefficients(phi: float, phi_in: float, sine_edge: float, distance_m: 
                        face_n: tuple[complex, complex]) -> tuple[complex, complex]:
     """Return the UTD diffraction coefficients of a wedge with lossy faces [2, eq. 25-28; 3].
 
-    Args:
-        phi: angle of the diffracted ray from face 0, across the edge [rad], 0 to n π.
-        phi_in: the same angle of the incident ray [rad].
-        sine_edge: sine of the angle between ray and edge.
-        distance_m: s s' sin² / (s + s') of the distances s' before and s after the edge [m].
-        wave_number: 2 π / wavelength [1/m].
-        n: exterior angle of the wedge divided by π.
-        face_0: reflection coefficients (TE, TM) of face 0 at its `face_sines`; (-1, 1) is a
-            perfect conductor.
-        face_n: the same of face n.
-
-    Returns:
-        The coefficients for the field along (soft) and across (hard) the edge [√m].
+    For the field along (soft) and across (hard) the edge [√m]. Angles of the diffracted and
+    incident ray are from face 0, across the edge [rad], 0 to n π, the exterior angle; `sine_edge`
+    is of the angle between ray and edge, `distance_m` s s' sin² / (s + s') of the distances s'
+    before and s after the edge. Faces have reflection coefficients (TE, TM) at their `face_sines`;
+    (-1, 1) is a perfect conductor.
     """
     soft_0, hard_0 = face_0
     soft_n, hard_n = face_n
@@ -219,12 +201,8 @@ def reflect(normal: np.ndarray, material: int, direction_in: np.ndarray, slabs: 
             field: np.ndarray) -> Triple:
     """Reflect the complex field (3,) of a ray in place, and return the reflected ray's direction.
 
-    Args:
-        normal: (3,) unit normal of the surface, to either side.
-        material: row of the material in `slabs`.
-        direction_in: (3,) unit vector of the incident ray.
-        slabs: materials.
-        field: (3,) complex field, changed in place.
+    The unit normal (3,) of the surface may point to either side; `direction_in` (3,) is a unit
+    vector.
     """
     cosine = dot(direction_in, normal)
     direction = (direction_in[0] - 2.0 * cosine * normal[0],
@@ -270,18 +248,10 @@ def around_edge(edges: np.ndarray, edge: int, x: float, y: float, z: float
 def diffract(edges: np.ndarray, edge: int, direction_in: np.ndarray, direction: np.ndarray,
              before_m: float, after_m: float, wave_number: float, slabs: Slabs, field: np.ndarray
              ) -> None:
-    """Replace a ray's field by the one that an edge diffracts (UTD), without spreading loss.
+    """Replace a ray's field (3,) by the one that an edge diffracts (UTD), without spreading loss.
 
-    Args:
-        edges: of `Surfaces`.
-        edge: row of `edges`.
-        direction_in: (3,) unit vector of the ray before the edge.
-        direction: (3,) unit vector of the ray after the edge.
-        before_m: length of the path before the edge [m].
-        after_m: length of the path after the edge [m].
-        wave_number: 2 π / wavelength [1/m].
-        slabs: materials of the city.
-        field: (3,) complex, changed in place.
+    Directions (3,) before and after the edge are unit vectors, lengths of the path before and after
+    it in metres.
     """
     row = edges[edge]
     along, tangent = row[ALONG:ALONG + 3], row[TANGENT:TANGENT + 3]

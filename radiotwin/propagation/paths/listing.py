@@ -23,13 +23,20 @@ from radiotwin.io.files import atomic_file, require_suffix, require_writable
 from radiotwin.maps.file import CONVENTIONS
 from radiotwin.propagation.paths.candidates import candidate_search
 from radiotwin.propagation.paths.fields import buffer_amplitudes
-from radiotwin.propagation.paths.images import MAX_INTERACTIONS, Candidates, PathBuffer, found_clear
+from radiotwin.propagation.paths.images import (
+    MAX_INTERACTIONS,
+    Candidates,
+    PathBuffer,
+    found_clear,
+    unit_vectors,
+)
 from radiotwin.propagation.paths.interactions import city_slabs
 from radiotwin.propagation.terrain import is_far, terrain_paths
 from radiotwin.runtime.console import progress
 from radiotwin.scene import Scene
 from radiotwin.scene.citymap import CityMap
 from radiotwin.trace.run import device_indices
+from radiotwin.trace.solver import power_to_db
 
 RECEIVER_CHUNK = 500  # receivers at a time
 PATH_CHUNK = 20_000  # paths at a time: about 10 MB
@@ -72,11 +79,6 @@ class Rays(NamedTuple):
     points_m: np.ndarray
     departure: np.ndarray
     arrival: np.ndarray
-
-    @property
-    def delay_s(self) -> np.ndarray:
-        """Return the delays (p,) [s]."""
-        return self.length_m / speed_of_light
 
 
 NO_RAYS = Rays(np.zeros(0, dtype=int), np.zeros(0, dtype=complex), np.zeros(0),
@@ -121,7 +123,7 @@ def _direct(city: CityMap, device_m: np.ndarray, ends_m: np.ndarray, wave_number
     """Return the direct paths (ITU-R P.525-4, eq. 4) to the receivers that see the device."""
     seen = np.flatnonzero(city.line_of_sight(device_m, ends_m))
     length_m = np.linalg.norm(ends_m[seen] - device_m, axis=1)
-    forth = (ends_m[seen] - device_m) / np.maximum(length_m, 1e-9)[:, None]
+    forth = unit_vectors(ends_m[seen] - device_m)
     amplitude = np.exp(-1j * wave_number * length_m) / np.maximum(2 * wave_number * length_m, 1e-9)
     return Rays(seen, amplitude, length_m, np.zeros((len(seen), MAX_INTERACTIONS), dtype=np.int8),
                 np.full((len(seen), MAX_INTERACTIONS, 3), np.nan), forth, -forth)
@@ -139,20 +141,16 @@ def _along_terrain(city: CityMap, device_m: np.ndarray, ends_m: np.ndarray, rows
     points_m = np.full((len(rows), MAX_INTERACTIONS, 3), np.nan)
     kinds[bent, 0], points_m[bent, 0] = TERRAIN, along.edge_m[bent]
     return Rays(rows, np.sqrt(along.gain) * np.exp(-1j * wave_number * sum(lengths_m)),
-                sum(lengths_m), kinds, points_m,
-                *(leg / length_m[:, None] for leg, length_m in zip(legs, lengths_m)))
+                sum(lengths_m), kinds, points_m, *map(unit_vectors, legs))
 
 
 def _rays(buffer: PathBuffer, rows: np.ndarray, kinds: np.ndarray, amplitude: np.ndarray,
           length_m: np.ndarray) -> Rays:
     """Return the paths in rows (p,) of a buffer with their directions and points."""
-    points_m, last = buffer.points_m[rows], buffer.count[rows] - 1
-    path = np.arange(len(rows))
-    ends = [points_m[:, 1] - points_m[:, 0], points_m[path, last - 1] - points_m[path, last]]
-    departure, arrival = (leg_m / np.maximum(np.linalg.norm(leg_m, axis=1, keepdims=True), 1e-9)
-                          for leg_m in ends)
-    between_m = np.where(kinds[:, :, None] == NO_INTERACTION, np.nan, points_m[:, 1:-1])
-    return Rays(buffer.receiver[rows], amplitude, length_m, kinds, between_m, departure, arrival)
+    between_m = np.where(kinds[:, :, None] == NO_INTERACTION, np.nan,
+                         buffer.points_m[rows, 1:-1])
+    return Rays(buffer.receiver[rows], amplitude, length_m, kinds, between_m,
+                *map(unit_vectors, buffer.end_legs_m(rows)))
 
 
 def _kinds(candidates: Candidates) -> np.ndarray:
@@ -289,7 +287,7 @@ def _describe(dataset: xr.Dataset, rays: Rays, frequency_hz: float, velocity: np
               bandwidth_hz: float | None) -> None:
     """Add the paths, and each link's gain, spreads and K factor, to a dataset of links."""
     links, link = dataset.sizes["link"], rays.receiver
-    amplitude, delay_s, kinds = rays.amplitude, rays.delay_s, rays.kinds
+    amplitude, delay_s, kinds = rays.amplitude, rays.length_m / speed_of_light, rays.kinds
     power = np.abs(amplitude) ** 2
     first_s = np.full(links, np.inf)
     np.minimum.at(first_s, link, delay_s)
@@ -298,8 +296,8 @@ def _describe(dataset: xr.Dataset, rays: Rays, frequency_hz: float, velocity: np
     count = np.bincount(link, minlength=links)
     values: dict[str, Any] = {
         "path_count": (count, {"sample_dimension": "path", "long_name": "number of paths"}),
-        "gain_db": _db(sums(power, link, links)),
-        "coherent_gain_db": _db(np.abs(sums(amplitude, link, links)) ** 2),
+        "gain_db": power_to_db(sums(power, link, links)),
+        "coherent_gain_db": power_to_db(np.abs(sums(amplitude, link, links)) ** 2),
         "first_delay_s": np.where(count > 0, first_s, np.nan),
         "rms_delay_spread_s": rms_spread(delay_s, power, link, links),
         "k_factor_db": k_factor_db(power, kinds[:, 0] == NO_INTERACTION, link, links)}
@@ -315,7 +313,7 @@ def _describe(dataset: xr.Dataset, rays: Rays, frequency_hz: float, velocity: np
         values[f"{end}_azimuth_spread_deg"] = angular_spread_deg(azimuth, power, link, links)
         values[f"{end}_zenith_spread_deg"] = angular_spread_deg(elevation, power, link, links)
         if end == "arrival" and velocity is not None:
-            shift_hz = doppler_hz(way, velocity, speed_of_light / frequency_hz)
+            shift_hz = way @ velocity / (speed_of_light / frequency_hz)  # approaching is positive
             of_paths["doppler_hz"] = shift_hz
             values["doppler_spread_hz"] = rms_spread(shift_hz, power, link, links)
     for name, value in values.items():
@@ -340,12 +338,6 @@ def _describe(dataset: xr.Dataset, rays: Rays, frequency_hz: float, velocity: np
                 "long_name": f"{name} part of the band-limited impulse response"}
 
 
-def _db(power: np.ndarray) -> np.ndarray:
-    """Convert power to decibels; NaN for zero power."""
-    with np.errstate(divide="ignore"):
-        return np.where(power > 0, 10 * np.log10(power), np.nan)
-
-
 def _write(dataset: xr.Dataset, path: Path | str) -> None:
     """Write the dataset as compressed NetCDF-4."""
     packed = {"zlib": True, "complevel": 4}
@@ -366,19 +358,11 @@ def sums(values: np.ndarray, link: np.ndarray, links: int) -> np.ndarray:
 
 
 def rms_spread(values: np.ndarray, power: np.ndarray, link: np.ndarray, links: int) -> np.ndarray:
-    """Return the power-weighted standard deviation of a quantity over the paths of each link.
+    """Return the power-weighted standard deviation (links,) of a quantity (p,) over a link's paths.
 
     For delays it is the RMS delay spread (Rappaport, "Wireless Communications", 2nd ed., 2002, eq.
-    5.35), for Doppler shifts the RMS Doppler spread.
-
-    Args:
-        values: (p,) quantity of each path.
-        power: (p,) power of each path, linear.
-        link: (p,) row of each path's link.
-        links: number of links.
-
-    Returns:
-        (links,) in the unit of `values`; NaN without a path.
+    5.35), for Doppler shifts the RMS Doppler spread. `power` (p,) is linear, `link` (p,) the row of
+    each path's link. NaN without a path.
     """
     total = sums(power, link, links)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -401,14 +385,7 @@ def angular_spread_deg(angle_rad: np.ndarray, power: np.ndarray, link: np.ndarra
 def k_factor_db(power: np.ndarray, direct: np.ndarray, link: np.ndarray, links: int) -> np.ndarray:
     """Return the Rician K factor (links,): power of the direct path over all others [dB].
 
-    Args:
-        power: (p,) power of each path, linear.
-        direct: (p,) bool, the path has no interaction.
-        link: (p,) row of each path's link.
-        links: number of links.
-
-    Returns:
-        NaN without a direct path, or without another path.
+    `direct` (p,): the path has no interaction. NaN without a direct path, or without another path.
     """
     direct_power, others = sums(power * direct, link, links), sums(power * ~direct, link, links)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -416,34 +393,14 @@ def k_factor_db(power: np.ndarray, direct: np.ndarray, link: np.ndarray, links: 
                         np.nan)
 
 
-def doppler_hz(arrival: np.ndarray, velocity_m_s: np.ndarray, wavelength_m: float) -> np.ndarray:
-    """Return the Doppler shifts (p,) [Hz] of paths to a moving receiver; approaching is positive.
-
-    Args:
-        arrival: (p, 3) unit vectors from the receiver along the paths.
-        velocity_m_s: (3,) velocity of the receiver [m/s].
-        wavelength_m: wavelength [m].
-    """
-    return arrival @ velocity_m_s / wavelength_m
-
-
 def impulse_response(amplitude: np.ndarray, excess_s: np.ndarray, link: np.ndarray, links: int,
                      bandwidth_hz: float, taps: int) -> np.ndarray:
-    """Return the band-limited impulse response of each link, sampled at the bandwidth.
+    """Return the band-limited impulse response (links, taps), complex, sampled at the bandwidth.
 
     Tap l of an ideal low-pass is the sum of a sinc(l - B τ) over the paths (Tse and Viswanath,
     "Fundamentals of Wireless Communication", 2005, eq. 2.34). Tap `EDGE_TAPS` is at excess delay 0.
-
-    Args:
-        amplitude: (p,) complex gain with the phase of the carrier over the total delay.
-        excess_s: (p,) delay after the link's first path [s].
-        link: (p,) row of each path's link, ascending.
-        links: number of links.
-        bandwidth_hz: bandwidth [Hz].
-        taps: number of taps.
-
-    Returns:
-        (links, taps) complex.
+    Amplitudes (p,) have the phase of the carrier over the total delay; `excess_s` (p,) is the delay
+    after the link's first path, `link` (p,) ascends.
     """
     response = np.zeros((links, taps), dtype=complex)
     tap = np.arange(taps) - EDGE_TAPS

@@ -1,6 +1,6 @@
 """Compute the power of all paths between a device and receivers: `path_powers`."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import NamedTuple
 
@@ -8,11 +8,17 @@ import numpy as np
 from scipy.constants import speed_of_light
 
 from radiotwin.errors import BadInput
-from radiotwin.propagation.paths.candidates import DEVICE_RAYS, CandidateSearch, candidate_search
+from radiotwin.propagation.paths.candidates import DEVICE_RAYS, candidate_search
 from radiotwin.propagation.paths.facets import expand
 from radiotwin.propagation.paths.fields import buffer_gains
-from radiotwin.propagation.paths.images import MAX_INTERACTIONS, Candidates, PathBuffer, found_clear
-from radiotwin.propagation.paths.interactions import Slabs, city_slabs
+from radiotwin.propagation.paths.images import (
+    MAX_INTERACTIONS,
+    Candidates,
+    PathBuffer,
+    found_clear,
+    unit_vectors,
+)
+from radiotwin.propagation.paths.interactions import city_slabs
 from radiotwin.propagation.paths.two_edges import paths_over_two_edges, two_edge_gains
 from radiotwin.propagation.terrain import is_far, terrain_paths
 from radiotwin.scene.antennas import Antenna
@@ -141,22 +147,13 @@ COMPONENTS = tuple(field.name for field in fields(PathPowers))[:-2]
 def path_powers(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, frequency_hz: float, *,
                 depth: int = DEPTH, rays: int = DEVICE_RAYS, candidates: Candidates | None = None
                 ) -> PathPowers:
-    """Find the paths from a device to receivers and add up their powers by kind.
+    """Find the paths from a device (3,) to receivers (n, 3) [m], and add up their powers by kind.
 
     Surfaces are slabs of the map's materials, the ground is a half space of `city.ground_material`.
-    Ends inside buildings are accepted, but their results mean little.
-
-    Args:
-        city: 3D map.
-        device_m: (3,) position [m].
-        receiver_m: (n, 3) positions of the receivers [m].
-        frequency_hz: carrier frequency [Hz].
-        depth: maximum number of interactions of a path, 1 to 6.
-        rays: number of rays shot from the device to find sequences of facets.
-        candidates: sequences to try instead, such as the `strongest` of a nearby position.
-
-    Raises:
-        BadInput: a position or the frequency is no number, or the depth is out of its range.
+    Ends inside buildings are accepted, but their results mean little. Paths have up to `depth`
+    interactions, 1 to 6; `rays` are shot from the device to find sequences of facets, or else
+    `candidates` are tried, such as the `strongest` of a nearby position. BadInput if a position or
+    the frequency is no number, or the depth is out of its range.
     """
     device_m = np.asarray(device_m, dtype=float)
     receiver_m = np.ascontiguousarray(receiver_m, dtype=float)
@@ -181,14 +178,12 @@ def path_powers(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, fre
         candidates = search.candidates(device_m, rays)
     kind = _kinds(candidates, search.is_ground)
     found = [(np.zeros(0, dtype=int), np.zeros(0, dtype=int), np.zeros(0))]
-    for clear, gain in clear_paths_gains(city, search, candidates, device_m, receiver_m[near],
-                                         buffer, wave_number, slabs):
-        link, points_m = near[buffer.receiver[clear]], buffer.points_m[clear]
-        last, path = buffer.count[clear] - 1, np.arange(len(clear))
-        np.add.at(powers, (kind[buffer.candidate[clear]], link), gain)
-        found.append((buffer.candidate[clear], link, gain))
-        directions.append(_directions(link, gain, points_m[:, 1] - points_m[:, 0],
-                                      points_m[path, last - 1] - points_m[path, last]))
+    for clear in found_clear(city, search.surfaces, candidates, device_m, receiver_m[near], buffer):
+        gain = buffer_gains(search.surfaces, candidates, wave_number, slabs, buffer, clear)
+        link, candidate = near[buffer.receiver[clear]], buffer.candidate[clear]
+        np.add.at(powers, (kind[candidate], link), gain)
+        found.append((candidate, link, gain))
+        directions.append(_directions(link, gain, *buffer.end_legs_m(clear)))
     over_seen_edge = (candidates.before[:, 0] < 0) & (candidates.edge >= 0)
     strongest = _strongest_candidates(candidates, found, powers.sum(axis=0), over_seen_edge)
     dark = near[powers[:, near].sum(axis=0) == 0]
@@ -215,11 +210,9 @@ def path_powers(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, fre
 
 def _strongest_candidates(candidates: Candidates, found: Sequence[tuple[np.ndarray, ...]],
                           total: np.ndarray, over_seen_edge: np.ndarray) -> Candidates:
-    """Select the candidates to try again from positions close by.
+    """Select the candidates to try again from positions close by: those of strong paths (p,).
 
-    These are all with a path above `WEAK_SHARE` of its link's power, and one for each edge that the
-    device sees. `found` has candidate, link and power (p,) of paths; `total` (n,) is a link's
-    power.
+    Also one for each edge that the device sees. `total` (n,) is a link's power.
     """
     candidate, link, power = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
     keep = over_seen_edge & (candidates.after[:, :1] < 0).all(axis=1)
@@ -229,46 +222,30 @@ def _strongest_candidates(candidates: Candidates, found: Sequence[tuple[np.ndarr
 
 def paths_with_points(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray,
                       frequency_hz: float) -> PathsWithPoints:
-    """Find single paths with their points of interaction.
+    """Find single paths from a device (3,) to receivers (n, 3) [m], with points of interaction.
 
     Unlike `path_powers`, without direct paths, paths over two edges, and along terrain.
-
-    Args:
-        city: 3D map.
-        device_m: (3,) position [m].
-        receiver_m: (n, 3) positions [m].
-        frequency_hz: carrier frequency [Hz].
     """
     search = candidate_search(city, DEPTH)
-    buffer = PathBuffer.allocate(PATH_CHUNK)
-    slabs = city_slabs(city, frequency_hz)
+    candidates, buffer = search.candidates(device_m), PathBuffer.allocate(PATH_CHUNK)
+    wave_number, slabs = 2 * np.pi * frequency_hz / speed_of_light, city_slabs(city, frequency_hz)
     no_points = np.zeros((0, *buffer.points_m.shape[1:]), dtype=np.float32)
     no_rows = np.zeros(0, dtype=int)
     parts = [PathsWithPoints(no_rows, np.zeros(0), no_points, no_rows)]
-    for clear, gain in clear_paths_gains(
-            city, search, search.candidates(device_m), device_m,
-            np.ascontiguousarray(receiver_m, dtype=float), buffer,
-            2 * np.pi * frequency_hz / speed_of_light, slabs):
+    for clear in found_clear(city, search.surfaces, candidates, device_m,
+                             np.ascontiguousarray(receiver_m, dtype=float), buffer):
+        gain = buffer_gains(search.surfaces, candidates, wave_number, slabs, buffer, clear)
         parts.append(PathsWithPoints(buffer.receiver[clear], gain,
                                      buffer.points_m[clear].astype(np.float32),
                                      buffer.count[clear]))
     return PathsWithPoints(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
-def clear_paths_gains(city: CityMap, search: CandidateSearch, candidates: Candidates,
-                      device_m: np.ndarray, receiver_m: np.ndarray, buffer: PathBuffer,
-                      wave_number: float, slabs: Slabs) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield rows (p,) of a buffer that hold unblocked paths, and their power gains (p,), linear."""
-    for clear in found_clear(city, search.surfaces, candidates, device_m, receiver_m, buffer):
-        yield clear, buffer_gains(search.surfaces, candidates, wave_number, slabs, buffer, clear)
-
-
 def _directions(link: np.ndarray, power: np.ndarray, departure_m: np.ndarray,
                 arrival_m: np.ndarray) -> PathDirections:
     """Return paths (p,) with unit vectors of their legs (p, 3) [m] from device and receiver."""
-    departure, arrival = (
-        (leg_m / np.maximum(np.linalg.norm(leg_m, axis=1, keepdims=True), 1e-9)).astype(np.float32)
-        for leg_m in (departure_m, arrival_m))
+    departure, arrival = (unit_vectors(leg_m).astype(np.float32)
+                          for leg_m in (departure_m, arrival_m))
     return PathDirections(link.astype(np.int32), power.astype(np.float32), departure, arrival)
 
 

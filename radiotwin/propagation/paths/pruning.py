@@ -48,21 +48,13 @@ def spheres_around(receiver_m: np.ndarray) -> np.ndarray:
 @njit(cache=True, error_model="numpy")
 def lit_part(planes: np.ndarray, edges: np.ndarray, edge: int, before: np.ndarray, image: np.ndarray
              ) -> tuple[float, float]:
-    """Return the part of an edge that the device's ray may hit after reflection at given facets.
+    """Return the part of an edge, from and to [m], that the device's ray may hit by given facets.
 
     A point at t metres along the edge is in front of a facet, and its line to the image passes
     within a side of the facet's rectangle, if expressions that are linear in t are positive. They
     are evaluated for the edge at the last facet, for its mirror image at the one before, and so on.
-
-    Args:
-        planes: of `Surfaces`.
-        edges: of `Surfaces`.
-        edge: row of `edges`.
-        before: (b,) facets before the edge.
-        image: (b + 1, 3) the device and its images in them [m].
-
-    Returns:
-        Start and end of the lit part along the edge [m]; it is empty if start >= end.
+    `image` (b + 1, 3) are the device and its images in the facets `before` (b,) [m]. Empty if start
+    >= end.
     """
     length_m = edges[edge, LENGTH]
     low_m, high_m = -ROUNDING_M, length_m + ROUNDING_M
@@ -112,26 +104,14 @@ def open_window(edges: np.ndarray, edge: int, lit_m: np.ndarray, window: np.ndar
 @njit(cache=True, error_model="numpy")
 def narrow(planes: np.ndarray, edges: np.ndarray, edge: int, after: np.ndarray, k: int,
            source_m: np.ndarray, window: np.ndarray) -> bool:
-    """Narrow a window of diffracted rays to those that pass through facet `after[k]`.
+    """Narrow a window (4,) of diffracted rays in place to those through facet `after[k]`.
 
     Positions along the edge: q of a point at distance r from the edge's line, s of the source at
-    distance d. The ray leaves the edge at t, where (q - s) d = (t - s) (d + r). So t is above a
-    bound if (q - s) d > (bound - s) (d + r). That holds for all points of a facet if it holds at
-    the corners of its rectangle: r is convex; where convexity does not help, a linear lower bound
-    of r is used. Facets are mirrored so that rays to them stay straight; the angle around the edge
-    is not changed by that.
-
-    Args:
-        planes: `Surfaces.planes`.
-        edges: `Surfaces.edges`.
-        edge: row of `edges`.
-        after: (b,) facets after the edge.
-        k: index in `after`.
-        source_m: (2,) position of the source along the edge, and distance from its line [m].
-        window: (4,) window narrowed to the facets before k, see `open_window`; changed in place.
-
-    Returns:
-        False if no ray passes; True may be wrong.
+    distance d, which are `source_m` (2,). The ray leaves the edge at t, where (q - s) d = (t - s)
+    (d + r). So t is above a bound if (q - s) d > (bound - s) (d + r). That holds for all points of
+    a facet if it holds at the corners of its rectangle: r is convex; where convexity does not help,
+    a linear lower bound of r is used. Facets are mirrored so that rays to them stay straight; the
+    angle around the edge is not changed by that. Returns False if no ray passes; True may be wrong.
     """
     facet = after[k]
     if facet == len(planes) - 1:
@@ -201,10 +181,7 @@ def _coordinate(point_m: np.ndarray, origin_m: np.ndarray, axis: np.ndarray) -> 
 @njit(cache=True, error_model="numpy")
 def _positive(at_start: float, at_end: float, length_m: float, low_m: float, high_m: float
               ) -> tuple[float, float]:
-    """Clip an interval along an edge [m] to where a function that is linear along it is positive.
-
-    `at_start` and `at_end` are its values at both ends of the edge; the interval 0, 0 is empty.
-    """
+    """Clip an interval along an edge [m] to where a linear function is positive; 0, 0 is empty."""
     if at_start < 0.0 and at_end < 0.0:
         return 0.0, 0.0
     if at_start < 0.0:
@@ -217,21 +194,10 @@ def _positive(at_start: float, at_end: float, length_m: float, low_m: float, hig
 @njit(cache=True, error_model="numpy")
 def through_facet(planes: np.ndarray, facet: int, image: np.ndarray, receiver_m: np.ndarray,
                   spheres: np.ndarray, possible: np.ndarray) -> int:
-    """Find the receivers that see an image through a facet's bounding rectangle.
+    """Find the receivers (n, 3) that see an image (3,) [m] through a facet's bounding rectangle.
 
-    Most candidates are rejected here, so this and `over_edge` use few scalars, which stay in
-    registers.
-
-    Args:
-        planes: `Surfaces.planes`.
-        facet: row of `planes`.
-        image: (3,) image of the device in the facet [m].
-        receiver_m: (n, 3) positions [m].
-        spheres: `spheres_around` the receivers.
-        possible: (n,) output: rows of the receivers.
-
-    Returns:
-        The number of rows in `possible`.
+    Writes their rows into `possible` (n,), and returns their number. Most candidates are rejected
+    here, so this and `over_edge` use few scalars, which stay in registers.
     """
     nx, ny, nz = planes[facet, NORMAL:NORMAL + 3]
     offset_m = planes[facet, OFFSET]
@@ -289,20 +255,8 @@ def over_edge(planes: np.ndarray, edges: np.ndarray, edge: int, after: np.ndarra
               frame: np.ndarray, possible: np.ndarray) -> int:
     """Find the receivers that a ray diffracted at the lit part of an edge may reach.
 
-    Args:
-        planes: `Surfaces.planes`.
-        edges: `Surfaces.edges`.
-        edge: row of `edges`.
-        after: facets after the edge.
-        window: (4,) window narrowed to all facets, see `open_window`.
-        source_m: (2,) position of the source along the edge, and distance from its line [m].
-        receiver_m: (n, 3) positions [m].
-        spheres: `spheres_around` the receivers.
-        frame: (3, 4) working memory.
-        possible: (n,) output: rows of the receivers.
-
-    Returns:
-        The number of rows in `possible`.
+    Writes their rows into `possible` (n,), and returns their number. `window` (4,) is narrowed to
+    all facets `after` the edge; `source_m` as in `narrow`; `frame` (3, 4) is working memory.
     """
     # All in metres from the edge's start. A receiver's image in the facets is an affine function of
     # its position. Allocating arrays would take longer than the geometry.

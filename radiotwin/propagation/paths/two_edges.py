@@ -81,10 +81,9 @@ def paths_over_two_edges(city: CityMap, surfaces: Surfaces, to_try: EdgePairsToT
 @njit(cache=True, nogil=True, error_model="numpy")
 def _possible(edges: np.ndarray, to_try: EdgePairsToTry, device_m: np.ndarray,
               receiver_m: np.ndarray) -> np.ndarray:
-    """List the paths over two edges that the cones of diffracted rays do not rule out.
+    """List rows (t, 3) of receiver, first and second edge that Keller's cones do not rule out.
 
-    A cone of Keller's at the first edge must meet the second, and the other way round. Returns rows
-    (t, 3) of receiver, first and second edge.
+    A cone at the first edge must meet the second, and the other way round.
     """
     n, seen = len(receiver_m), len(to_try.edge)
     end_m = np.empty((len(edges), 2, 3))
@@ -119,8 +118,7 @@ def _possible(edges: np.ndarray, to_try: EdgePairsToTry, device_m: np.ndarray,
 def _cone_meets(edges: np.ndarray, edge: int, from_m: np.ndarray, end_m: np.ndarray) -> bool:
     """Return False if no ray from a point (3,), diffracted by an edge, meets a segment (2, 3) [m].
 
-    Positions along the edge (s of the point, q) and distances from it (d, r) are as in
-    `pruning.narrow`. True may be wrong.
+    Letters are as in `pruning.narrow`. True may be wrong.
     """
     _, s, d = around_edge(edges, edge, from_m[0], from_m[1], from_m[2])
     low_m, high_m, most_m = np.inf, -np.inf, 0.0
@@ -139,9 +137,8 @@ def _solve(edges: np.ndarray, tried: np.ndarray, device_m: np.ndarray, receiver_
            ) -> tuple[np.ndarray, np.ndarray]:
     """Find the shortest path over each pair of edges in `tried` (t, 3), from device to receiver.
 
-    Returns:
-        (t, 4, 3) device, points on both edges, receiver [m]; and the rows with a path along the
-        edges and outside both wedges. Other rows are not written.
+    Returns its points (t, 4, 3) [m], and the rows with a path along the edges and outside both
+    wedges. Other rows are not written.
     """
     points_m, possible = np.empty((len(tried), 4, 3)), np.empty(len(tried), dtype=np.int64)
     count = 0
@@ -166,20 +163,12 @@ def _solve(edges: np.ndarray, tried: np.ndarray, device_m: np.ndarray, receiver_
 @njit(cache=True, error_model="numpy")
 def shortest(one: np.ndarray, other: np.ndarray, from_m: np.ndarray, to_m: np.ndarray
              ) -> tuple[float, float]:
-    """Find the shortest path between two points over the lines of two edges (Fermat's principle).
+    """Find the shortest path between points (3,) over the lines of two edges (Fermat's principle).
 
     The length is convex in both positions; Newton's method with halved steps finds its minimum,
-    where Keller's law holds at both edges.
-
-    Args:
-        one: first edge, a row of `Surfaces.edges`.
-        other: second edge.
-        from_m: (3,) start of the path [m].
-        to_m: (3,) end of the path [m].
-
-    Returns:
-        Positions along the edges from their starts [m]; (-1, -1) if no path is found: it passes the
-        intersection of the edges, an end lies on an edge, or the iteration does not converge.
+    where Keller's law holds at both edges. Returns positions along the edges [m]; (-1, -1) if no
+    path is found: it passes the intersection of the edges, an end lies on an edge, or the iteration
+    does not converge.
     """
     a, b = one[ALONG:ALONG + 3], other[ALONG:ALONG + 3]
     apart = other[START:START + 3] - one[START:START + 3]
@@ -226,17 +215,11 @@ def wave_at_edge(near_m: float, between_m: float, far_m: float, sine2: float
                  ) -> tuple[float, float]:
     """Compute the distance parameter at one of two edges, for the wave diffracted by the other.
 
-    Args:
-        near_m: length of the leg from this edge to the nearer end of the path [m].
-        between_m: length of the leg between the edges [m].
-        far_m: length of the leg from the other edge to its end of the path [m].
-        sine2: squared sine of the angle between the two planes that the ray between the edges spans
-            with either edge.
-
-    Returns:
-        Distance parameter of this edge's transition function, divided by sin² of the angle between
-        ray and edge [m] (Kouyoumjian and Pathak, eq. 33), and the length s' [m] for which s s' / (s
-        + s') with s = `near_m` is that distance.
+    Legs are from this edge to the nearer end of the path, between the edges, and from the other
+    edge to its end [m]; `sine2` is of the angle between the planes that the ray between the edges
+    spans with them. Returns the parameter of this edge's transition function over sin² of the angle
+    between ray and edge [m] (Kouyoumjian and Pathak, eq. 33), and the length s' [m] for which s s'
+    / (s + s') with s = `near_m` is that distance.
     """
     curvature = (1.0 - sine2) / (between_m + far_m) + sine2 / between_m
     distance_m = near_m * (1.0 + near_m * curvature) * between_m * (between_m + far_m) \
