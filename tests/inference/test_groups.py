@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from radiotwin.inference.groups import (
     Groups,
@@ -63,14 +62,6 @@ def test_an_outlier_does_not_widen_the_spread_that_it_is_compared_with():
     assert found.spread[5] < 0.35 and found.size[5] == pytest.approx(-6.05, abs=0.1)
     log_odds = found.log_odds(5.0, 0.1)
     assert log_odds[5] > 10 and (np.delete(log_odds, 5) < -2).all()
-
-
-def test_log_odds_compare_the_density_of_peers_with_that_of_outliers():
-    found = compare_with_peers(Statistic(np.array([0.0, 1.0, 0.5, 0.4]), np.full(4, 0.2)), 0.5, np.inf)
-    total = np.hypot(found.error, found.spread)
-    expected = (stats.t(2, scale=np.hypot(total, 5)).logpdf(found.size)
-                - stats.t(62, scale=total).logpdf(found.size) + np.log(0.1 / 4))
-    assert found.log_odds(5.0, 0.1) == pytest.approx(expected)
 
 
 def test_two_parts_of_the_data_are_weighted_by_precision():

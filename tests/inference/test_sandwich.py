@@ -23,11 +23,6 @@ def test_without_clusters_it_is_the_covariance_of_least_squares():
     assert scores.covariances([])[0] == pytest.approx(4.0 * np.linalg.inv(columns.T @ columns))
 
 
-def test_a_prior_alone_is_the_interval():
-    _, scores = scores_of(np.zeros((5, 1)), np.ones(5), precision=np.array([0.25]))
-    assert np.sqrt(max(each[0, 0] for each in scores.covariances([np.arange(5)]))) == pytest.approx(2.0)
-
-
 def test_rows_that_are_copies_count_once():
     """Ten copies of 40 rows: the mean's sd is that of 40, with Student's t of 39."""
     rng = np.random.default_rng(1)

@@ -1,9 +1,7 @@
 """Powers of links over a city, and closed forms that several tests compare them with."""
 
 import numpy as np
-import trimesh
 
-from radiotwin.links import LinkGeometry
 from radiotwin.propagation.paths import PathPowers, path_powers
 from radiotwin.propagation.paths.powers import COMPONENTS, PathDirections
 from radiotwin.scene.citymap import CityMap
@@ -38,19 +36,6 @@ def knife_edge_db(height_m, before_m, after_m):
     """Loss of an edge above the straight line (ITU-R P.526-15, eq. 26 and 31)."""
     v = height_m * np.sqrt(2 / WAVELENGTH_M * (1 / before_m + 1 / after_m))
     return 6.9 + 20 * np.log10(np.sqrt((v - 0.1) ** 2 + 1) + v - 0.1)
-
-
-def blocks(*bounds, **given):
-    """A map of upright boxes, each given by its lowest and highest corner [m]."""
-    mesh = trimesh.util.concatenate([trimesh.creation.box(bounds=each) for each in bounds])
-    return CityMap(mesh.vertices, mesh.faces, **given)
-
-
-def links_over(city, device_m, receiver_m, device=None, frequency_hz=FREQUENCY_HZ):
-    """Links over a map, each with the line of sight that it has there; one device if none is given."""
-    device_m = np.zeros(receiver_m.shape) + device_m
-    device = np.zeros(len(receiver_m), int) if device is None else device
-    return LinkGeometry(device_m, receiver_m, city.line_of_sight(device_m, receiver_m), device, city, frequency_hz)
 
 
 def flat(half_m=500.0, z_m=0.0, **given):

@@ -18,17 +18,12 @@ def put(store, name, array):
     store.put(piece(name, len(array)), array, [], 0.0)
 
 
-def test_array_comes_back_to_the_bit(tmp_path):
+def test_a_batch_comes_back_to_the_bit_for_its_own_key(tmp_path):
     array = np.random.default_rng(0).normal(size=7)
     array[3] = np.nan
     put(BatchStore(tmp_path, {"a": 1}), "batch", array)
     assert BatchStore(tmp_path, {"a": 1}).get(piece("batch", 7))[0].tobytes() == array.tobytes()
-
-
-def test_keys_do_not_see_each_other(tmp_path):
-    put(BatchStore(tmp_path, {"a": 1}), "batch", np.zeros(3))
-    assert BatchStore(tmp_path, {"a": 2}).get(piece("batch", 3)) is None
-    assert len(list((tmp_path / "cache").iterdir())) == 2
+    assert BatchStore(tmp_path, {"a": 2}).get(piece("batch", 7)) is None
 
 
 def test_a_link_out_of_the_scene_is_refused_before_anything_is_written(tmp_path):
@@ -42,28 +37,21 @@ def test_a_link_out_of_the_scene_is_refused_before_anything_is_written(tmp_path)
     assert not list(outside.iterdir())
 
 
-@pytest.mark.parametrize("spoil", [b"", b"\x93NUMPY\x01", b"no array", "zip", "pickle", "huge", "int", "short", "pipe", "folder"])
+SPOIL = {
+    "empty": lambda path, data: path.write_bytes(b""), "no array": lambda path, data: path.write_bytes(b"no array"),
+    "short": lambda path, data: path.write_bytes(data[:-1]),
+    "huge": lambda path, data: path.write_bytes(data.replace(b"(4,)", b"(4000000000000,)")),
+    "integers": lambda path, data: np.save(path, np.arange(4)),
+    "pickle": lambda path, data: np.save(path, np.array([{}] * 4), allow_pickle=True),
+    "pipe": lambda path, data: os.mkfifo(path), "folder": lambda path, data: path.mkdir()}
+
+
+@pytest.mark.parametrize("spoil", SPOIL)
 def test_a_damaged_batch_or_one_of_a_stranger_counts_as_missing(tmp_path, spoil):
     store = BatchStore(tmp_path, {"a": 1})
     put(store, "b", np.arange(4.0))
     path = store.folder / "b.npy"
     data = path.read_bytes()
     path.unlink()
-    if isinstance(spoil, bytes):
-        path.write_bytes(spoil)
-    elif spoil == "zip":
-        np.savez(path.with_suffix(".npz"), np.arange(4.0))
-        path.with_suffix(".npz").rename(path)
-    elif spoil == "pickle":
-        np.save(path, np.array([{}] * 4), allow_pickle=True)
-    elif spoil == "huge":
-        path.write_bytes(data.replace(b"(4,)", b"(4000000000000,)"))
-    elif spoil == "int":
-        np.save(path, np.arange(4))
-    elif spoil == "short":
-        path.write_bytes(data[:-1])
-    elif spoil == "pipe":
-        os.mkfifo(path)
-    else:
-        path.mkdir()
+    SPOIL[spoil](path, data)
     assert store.get(piece("b", 4)) is None

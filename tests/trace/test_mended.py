@@ -1,23 +1,21 @@
-"""Sionna RT's diffraction as it is mended, against the uniform theory of diffraction, written here from the papers.
+"""Sionna RT's diffraction as it is mended, against the uniform theory of diffraction, written from the papers.
 
-Kouyoumjian and Pathak, Proc. IEEE 62(11), 1974, eq. 25-29 at normal incidence, with the reflections of Luebbers,
-IEEE Trans. AP 32(1), 1984, at the smaller of the angles of the two rays to each face; slabs by ITU-R P.2040-4, eq. 43a.
+Faces reflect at the smaller of the angles of the two rays; slabs by ITU-R P.2040-4, eq. 43a.
 """
 
 import numpy as np
 import pytest
 import trimesh
-from scipy.special import modfresnelm
 
 from radiotwin.coverage import CoverageSettings, Transmitter, predict_coverage
-from radiotwin.errors import BadInput
 from radiotwin.propagation.paths.listing import list_paths
 from radiotwin.scene.folder import CityShape, write_city
 from radiotwin.scene.materials import Material
-from radiotwin.trace import mended, trace_gains
+from radiotwin.trace import trace_gains
 from radiotwin.trace.settings import SolverSettings
 from radiotwin.trace.solver import PathGains
 from tests.coverage.conftest import write_scene
+from tests.propagation import wedges
 
 FREQUENCY_HZ = 2.4e9
 WAVELENGTH_M = 299_792_458.0 / FREQUENCY_HZ
@@ -27,10 +25,6 @@ METAL = Material("metal", itu="metal")
 CONCRETE = Material("concrete", relative_permittivity=PERMITTIVITY, conductivity_s_per_m=CONDUCTIVITY, thickness_m=THICKNESS_M)
 SETTINGS = SolverSettings(samples_per_src=50_000, batch_receivers=8, max_num_paths_per_src=20_000)
 NEAR_M = np.array([0.5, 1.0, 2.0, 5.0, 12.0, 25.0])
-
-
-def transition(x):
-    return 2j * np.sqrt(x) * np.exp(1j * x) * modfresnelm(np.sqrt(x))[0]
 
 
 def slab(sine, is_soft):
@@ -43,23 +37,13 @@ def slab(sine, is_soft):
 
 def wedge(before_m, after_m, phi_in, phi, n, material, is_soft):
     """Coefficient [m^0.5] of angles from face 0; soft: field along the edge."""
-    if material is METAL:
-        at_0 = at_n = -1 if is_soft else 1
-    else:
-        at_0, at_n = slab(np.sin(min(phi, phi_in)), is_soft), slab(np.sin(n * np.pi - max(phi, phi_in)), is_soft)
-    spread_m = before_m * after_m / (before_m + after_m)
-
-    def term(beta, sign):
-        turns = np.round((beta + sign * np.pi) / (2 * np.pi * n))
-        a = 2 * np.cos((2 * np.pi * n * turns - beta) / 2) ** 2
-        return transition(K * spread_m * a) / np.tan((np.pi + sign * beta) / (2 * n))
-
-    return -np.exp(-0.25j * np.pi) / (2 * n * np.sqrt(2 * np.pi * K)) * (
-        term(phi - phi_in, 1) + term(phi - phi_in, -1) + at_0 * term(phi + phi_in, -1) + at_n * term(phi + phi_in, 1))
+    grazing = np.sin(min(phi, phi_in)), np.sin(n * np.pi - max(phi, phi_in))
+    reflected = [(-1 if is_soft else 1) if material is METAL else slab(sine, is_soft) for sine in grazing]
+    return wedges.wedge(before_m, after_m, phi_in, phi, n, reflected, WAVELENGTH_M)
 
 
 def gain(before_m, after_m, coefficient):
-    return (WAVELENGTH_M / (4 * np.pi)) ** 2 * abs(coefficient) ** 2 / (before_m * after_m * (before_m + after_m))
+    return wedges.gain(before_m, after_m, coefficient, WAVELENGTH_M)
 
 
 def both_ways(folder, shapes, far_m, near_m, **others):
@@ -171,18 +155,3 @@ def test_as_released_is_one_setting_away(tmp_path):
     near_m = np.array([[40.0, -0.5, 3.0]])
     _, from_db = both_ways(tmp_path, [box], np.array([-30.0, 20.0, 3.0]), near_m, diffraction="sionna")
     assert from_db == pytest.approx(-106.5, abs=0.7)
-
-
-def test_another_version_is_used_as_it_is_with_a_warning(monkeypatch):
-    monkeypatch.setattr(mended, "installed_version", lambda: "2.3.0")
-    with pytest.warns(UserWarning, match=r"Sionna RT 2\.3\.0 is installed.*known for 2\.2\.0 only"):
-        assert SolverSettings().diffraction == "sionna"
-    with pytest.raises(BadInput, match=r"'reciprocal' mends Sionna RT 2\.2\.0, and 2\.3\.0 is installed; take"):
-        SolverSettings(diffraction="reciprocal")
-
-
-def test_the_wedge_is_in_the_attributes_and_the_shipped_maps_have_none():
-    assert SolverSettings(diffraction="reciprocal").attributes()["wedge"] == "reciprocal"
-    for name, number in (("sionna", 1), ("off", 0)):
-        attributes = SolverSettings(diffraction=name).attributes()
-        assert attributes["diffraction"] == number and "wedge" not in attributes

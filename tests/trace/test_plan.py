@@ -2,7 +2,6 @@
 
 import pytest
 
-from radiotwin.errors import BadInput
 from radiotwin.trace import SolverSettings, trace_map
 from radiotwin.trace.plan import CALIBRATED, TracePlan, plan_trace
 
@@ -19,15 +18,6 @@ def test_workers_share_what_is_left():
     rows = PLAN.rows()
     assert [count for count, *_ in rows] == [1, 2, 4, 8, 16, 64, 256]
     assert rows[1] == (2, 109.0, 2 * 2.0**31)
-
-
-def test_nothing_is_left_of_a_finished_trace():
-    assert TracePlan(**{**vars(PLAN), "finished": 100}).seconds(1) == 0
-
-
-def test_a_device_that_is_not_there(small_scene):
-    with pytest.raises(BadInput, match="device 'd99' is not in"):
-        plan_trace(small_scene, SolverSettings(), ["d99"])
 
 
 @pytest.mark.llvm

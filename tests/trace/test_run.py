@@ -18,6 +18,7 @@ from radiotwin.trace.run import truth_path
 SETTINGS = SolverSettings(batch_receivers=100)
 BATCHES = 6  # of 2 x 16 x 16 positions
 DEVICES = 7
+COUNTS = ("detected", "without_path", "below_sensitivity", "inside_building")
 
 
 def with_radio(scene, **changes):
@@ -30,40 +31,82 @@ def batch_files(scene):
     return sorted((scene.folder / "cache").glob("trace-*/device-*-batch-*.npy"))
 
 
-def test_map_holds_the_gains_of_every_link(own_scene, law, tmp_path):
-    returned = trace_map(own_scene, SETTINGS, tmp_path / "truth.nc")
+def test_map_holds_the_gains_of_every_link_and_says_what_was_done(own_scene, law, tmp_path):
+    scene = with_radio(own_scene, sensitivity_dbm=-110.0)
+    returned = trace_map(scene, SETTINGS, tmp_path / "truth.nc")
     read = RadioMap.load(tmp_path / "truth.nc")
     assert np.array_equal(read.gain_db, returned.gain_db, equal_nan=True)
-    assert read.devices == [device.device for device in own_scene.config.devices]
-    raw_db = np.stack([law(None, 2.4e9, SETTINGS).solve(device_m, own_scene.lattice.positions_m)
-                       for device_m in own_scene.device_m]).reshape(read.gain_db.shape)
-    detected = raw_db >= own_scene.config.gain_limit_db
-    assert 0.5 < detected.mean() < 1
+    assert read.devices == [device.device for device in scene.config.devices]
+    raw_db = np.stack([law(None, 2.4e9, SETTINGS).solve(device_m, scene.lattice.positions_m)
+                       for device_m in scene.device_m]).reshape(read.gain_db.shape)
+    detected = raw_db >= scene.config.gain_limit_db
     assert np.array_equal(np.isfinite(read.gain_db), detected)
     assert read.gain_db[detected] == pytest.approx(raw_db[detected], abs=1e-4)
+    attributes = returned.dataset.attrs
+    expected = {"source": "raytrace", "frequency_hz": 2.4e9, "scene_hash": scene.content_hash(), "combining": "power",
+                "max_depth": SETTINGS.max_depth, "noise_floor_db": 0}  # the law has no noise
+    assert {name: attributes[name] for name in expected} == expected and attributes["sionna_rt_version"]
+    counts = [attributes[f"links_{name}"] for name in COUNTS]
+    assert sum(counts) == DEVICES * 512 and min(counts[:3]) > 0
+    part = trace_map(scene, SETTINGS, tmp_path / "part.nc", devices=["d4", "d1"])
+    assert part.devices == ["d4", "d1"] and np.array_equal(part.gain_db, returned.gain_db[[4, 1]], equal_nan=True)
+    with pytest.raises(BadInput, match="'d99' is not in .*it has d0, d1"):
+        trace_map(scene, SETTINGS, tmp_path / "truth.nc", devices=["d99"])
 
 
-def test_attributes_say_what_was_done(own_scene, law, tmp_path):
-    attributes = trace_map(with_radio(own_scene, sensitivity_dbm=-110.0), SETTINGS, tmp_path / "truth.nc").dataset.attrs
-    assert attributes["source"] == "raytrace"
-    assert attributes["frequency_hz"] == 2.4e9
-    assert attributes["scene_hash"] == Scene.load(own_scene.folder).content_hash()
-    assert attributes["max_depth"] == SETTINGS.max_depth and attributes["combining"] == "power"
-    assert attributes["noise_floor_db"] == 0  # the law has none
-    assert attributes["sionna_rt_version"]
-    counts = [attributes[f"links_{name}"] for name in
-              ("detected", "without_path", "below_sensitivity", "inside_building")]
-    assert sum(counts) == DEVICES * 512
-    assert min(counts[:3]) > 0
+def test_only_what_is_missing_damaged_or_asked_otherwise_is_solved(own_scene, law, tmp_path):
+    """A finished map needs no cache; a part of the cache is enough; other settings, devices or geometry are solved anew."""
+    path = tmp_path / "truth.nc"
+
+    def calls(target, settings=SETTINGS, devices=None):
+        law.calls = 0
+        made = trace_map(Scene.load(own_scene.folder), settings, target, devices)
+        return law.calls, made
+
+    solved, first = calls(path)
+    files = batch_files(own_scene)
+    assert solved >= len(files) == DEVICES * BATCHES
+    assert calls(tmp_path / "again.nc")[0] == 0 and (tmp_path / "again.nc").read_bytes() == path.read_bytes()
+    files[3].unlink()
+    files[8].write_bytes(files[8].read_bytes()[:100])
+    np.save(files[11], np.zeros(3))
+    solved, again = calls(tmp_path / "repaired.nc")
+    assert solved == 3 and again.gain_db.tobytes() == first.gain_db.tobytes()
+    assert calls(path, SolverSettings(batch_receivers=100, seed=2))[0] >= DEVICES * BATCHES
+    assert set(files) < set(batch_files(own_scene))
+    shutil.rmtree(own_scene.folder / "cache")
+    solved, kept = calls(tmp_path / "again.nc")
+    assert solved == 0 and kept.gain_db.tobytes() == first.gain_db.tobytes()
+    assert calls(tmp_path / "again.nc", devices=["d1"])[0] > 0
+    with open(own_scene.xml_path, "a") as xml:
+        xml.write("<!-- changed -->")
+    assert calls(tmp_path / "again.nc")[0] >= DEVICES * BATCHES
 
 
-def test_rerun_solves_nothing_and_gives_the_same_file(own_scene, law, tmp_path):
-    trace_map(own_scene, SETTINGS, tmp_path / "first.nc")
-    solved = law.calls
-    assert solved >= DEVICES * BATCHES
-    trace_map(Scene.load(own_scene.folder), SETTINGS, tmp_path / "second.nc")
-    assert law.calls == solved
-    assert (tmp_path / "first.nc").read_bytes() == (tmp_path / "second.nc").read_bytes()
+def test_a_map_that_physics_does_not_allow_is_not_written(own_scene, law, tmp_path):
+    law.offset_db = 5.0
+    with pytest.raises(RunFailed, match="from free space"):
+        trace_map(own_scene, SETTINGS, tmp_path / "truth.nc")
+    assert not list(tmp_path.glob("*.nc"))
+
+
+def test_an_impossible_link_is_left_out_counted_and_told(own_scene, law, tmp_path):
+    whole = trace_map(own_scene, SETTINGS, tmp_path / "whole.nc")
+    shutil.rmtree(own_scene.folder / "cache")
+    index = np.flatnonzero(np.isfinite(whole.gain_db.reshape(DEVICES, -1)).all(axis=0))[:3]
+    law.impossible_m = own_scene.lattice.positions_m[index].tolist()
+    for name in ("map.nc", "again.nc"):
+        with pytest.warns(UserWarning, match=f"{3 * DEVICES} of {DEVICES * 512} links carry more power than their paths"):
+            trace_map(own_scene, SETTINGS, tmp_path / name)
+    assert (tmp_path / "again.nc").read_bytes() == (tmp_path / "map.nc").read_bytes()
+    read = RadioMap.load(tmp_path / "map.nc")
+    found, before = read.dataset.attrs, whole.dataset.attrs
+    assert [found[f"links_{name}"] - before[f"links_{name}"] for name in (*COUNTS, "impossible")] \
+        == [-3 * DEVICES, 0, 0, 0, 3 * DEVICES]
+    expected_db = whole.gain_db.copy().reshape(DEVICES, -1)
+    expected_db[:, index] = np.nan
+    assert np.array_equal(read.gain_db.reshape(DEVICES, -1), expected_db, equal_nan=True)
+    assert np.isfinite(found["noise_floor_db"])
 
 
 def test_a_place_on_the_globe_that_is_given_later_is_written_into_the_map(own_scene, law, tmp_path):
@@ -81,59 +124,6 @@ def test_a_place_on_the_globe_that_is_given_later_is_written_into_the_map(own_sc
     assert law.calls == solved and RadioMap.load(path).dataset.identical(plain.dataset)
 
 
-def test_only_what_is_missing_or_damaged_is_solved_again(own_scene, law, tmp_path):
-    first = trace_map(own_scene, SETTINGS, tmp_path / "truth.nc")
-    files = batch_files(own_scene)
-    assert len(files) == DEVICES * BATCHES
-    files[3].unlink()
-    files[8].write_bytes(files[8].read_bytes()[:100])
-    np.save(files[11], np.zeros(3))
-    law.calls = 0
-    again = trace_map(own_scene, SETTINGS, tmp_path / "again.nc")
-    assert law.calls == 3
-    assert again.gain_db.tobytes() == first.gain_db.tobytes()
-
-
-@pytest.mark.parametrize("change", [{"max_depth": 3}, {"seed": 2}, {"batch_receivers": 50}])
-def test_other_settings_are_solved_anew_beside_the_old(own_scene, law, tmp_path, change):
-    trace_map(own_scene, SETTINGS, tmp_path / "truth.nc")
-    old = batch_files(own_scene)
-    law.calls = 0
-    trace_map(own_scene, SolverSettings(**({"batch_receivers": 100} | change)), tmp_path / "truth.nc")
-    assert law.calls >= DEVICES * BATCHES
-    assert set(old) < set(batch_files(own_scene))
-
-
-def test_changed_geometry_is_solved_anew(own_scene, law, tmp_path):
-    trace_map(own_scene, SETTINGS, tmp_path / "truth.nc")
-    law.calls = 0
-    with open(own_scene.xml_path, "a") as xml:
-        xml.write("<!-- changed -->")
-    trace_map(Scene.load(own_scene.folder), SETTINGS, tmp_path / "truth.nc")
-    assert law.calls >= DEVICES * BATCHES
-
-
-def test_some_devices_are_the_rows_of_the_whole_map(own_scene, law, tmp_path):
-    part = trace_map(own_scene, SETTINGS, tmp_path / "part.nc", devices=["d4", "d1"])
-    whole = trace_map(own_scene, SETTINGS, tmp_path / "whole.nc")
-    assert part.devices == ["d4", "d1"]
-    assert np.array_equal(part.gain_db, whole.gain_db[[4, 1]], equal_nan=True)
-
-
-def test_unknown_device_is_bad_input(own_scene, law, tmp_path):
-    with pytest.raises(BadInput, match="'d99' is not in .*it has d0, d1"):
-        trace_map(own_scene, SETTINGS, tmp_path / "truth.nc", devices=["d99"])
-
-
-@pytest.mark.parametrize(("offset_db", "message"), [(5.0, "from free space"), (-3.0, "from free space"),
-                                                    (120.0, "more power")])
-def test_map_that_physics_does_not_allow_is_not_written(own_scene, law, tmp_path, offset_db, message):
-    law.offset_db = offset_db
-    with pytest.raises(RunFailed, match=message):
-        trace_map(own_scene, SETTINGS, tmp_path / "truth.nc")
-    assert not list(tmp_path.glob("*.nc"))
-
-
 def test_positions_inside_buildings_have_no_gain(own_scene, law, tmp_path):
     lattice = own_scene.config.lattice.model_copy(update={"altitudes_m": [5.0]})
     write_config(own_scene.config.model_copy(update={"lattice": lattice, "uavs": []}), own_scene.folder / "scene.toml")
@@ -143,39 +133,6 @@ def test_positions_inside_buildings_have_no_gain(own_scene, law, tmp_path):
     radio_map = trace_map(scene, SETTINGS, tmp_path / "truth.nc")
     assert np.isnan(radio_map.gain_db.reshape(DEVICES, -1)[:, inside]).all()
     assert radio_map.dataset.attrs["links_inside_building"] == DEVICES * inside.sum()
-
-
-def test_a_finished_map_is_known_without_its_cache(own_scene, law, tmp_path):
-    """A map that ships, or was moved, is not traced again; other settings, devices or a damaged file are."""
-    first = trace_map(own_scene, SETTINGS, tmp_path / "map.nc")
-    shutil.rmtree(own_scene.folder / "cache")
-    calls = law.calls
-    again = trace_map(own_scene, SETTINGS, tmp_path / "map.nc")
-    assert law.calls == calls and again.gain_db.tobytes() == first.gain_db.tobytes()
-    trace_map(own_scene, SETTINGS, tmp_path / "map.nc", ["d1"])
-    assert law.calls > calls
-
-
-def test_an_impossible_link_is_left_out_counted_and_told(own_scene, law, tmp_path):
-    trace_map(own_scene, SETTINGS, tmp_path / "whole.nc")
-    whole = RadioMap.load(tmp_path / "whole.nc")
-    shutil.rmtree(own_scene.folder / "cache")
-    index = np.flatnonzero(np.isfinite(whole.gain_db.reshape(DEVICES, -1)).all(axis=0))[:3]
-    law.impossible_m = own_scene.lattice.positions_m[index].tolist()
-    with pytest.warns(UserWarning, match=f"{3 * DEVICES} of {DEVICES * 512} links carry more power than their paths"):
-        trace_map(own_scene, SETTINGS, tmp_path / "map.nc")
-    read = RadioMap.load(tmp_path / "map.nc")
-    assert read.dataset.attrs["links_impossible"] == 3 * DEVICES and whole.dataset.attrs["links_impossible"] == 0
-    counts = [f"links_{name}" for name in ("detected", "without_path", "below_sensitivity", "inside_building")]
-    assert [read.dataset.attrs[name] - whole.dataset.attrs[name] for name in counts] == [-3 * DEVICES, 0, 0, 0]
-    expected_db = whole.gain_db.copy().reshape(DEVICES, -1)
-    expected_db[:, index] = np.nan
-    assert np.array_equal(read.gain_db.reshape(DEVICES, -1), expected_db, equal_nan=True)
-    assert np.isfinite(read.dataset.attrs["noise_floor_db"])
-    calls = law.calls
-    with pytest.warns(UserWarning, match="carry more power"):
-        trace_map(own_scene, SETTINGS, tmp_path / "again.nc")
-    assert law.calls == calls and (tmp_path / "again.nc").read_bytes() == (tmp_path / "map.nc").read_bytes()
 
 
 def test_a_truth_that_leads_out_of_the_scene_is_neither_read_nor_replaced(own_scene, law, tmp_path):

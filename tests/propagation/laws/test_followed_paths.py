@@ -27,16 +27,16 @@ def geometry():
     return LinkGeometry(device_m, receiver_m, city.line_of_sight(device_m, receiver_m), device, city, 2.4e9)
 
 
-@pytest.mark.parametrize("threads", ["1", "3"])
-def test_several_devices_are_followed_as_each_by_itself(geometry, monkeypatch, tmp_path, threads):
+def test_several_devices_are_followed_as_each_by_itself(geometry, monkeypatch, tmp_path):
+    """By one thread or three, in one batch or several, and from what an earlier run kept."""
     alone = np.zeros(len(geometry))
     for device in range(DEVICES):
         rows = np.flatnonzero(geometry.device == device)
         alone[rows] = path_gains(geometry.select(rows))
     assert (alone > 0).all()
-    monkeypatch.setenv("OMP_NUM_THREADS", threads)
     monkeypatch.setattr("radiotwin.runtime.pieces.MIN_SECONDS", 0.0)
-    for most in (followed_paths.BATCH_LINKS, 1.5 * RECEIVERS):
+    for threads, most in (("3", followed_paths.BATCH_LINKS), ("1", 1.5 * RECEIVERS)):
+        monkeypatch.setenv("OMP_NUM_THREADS", threads)
         monkeypatch.setattr(followed_paths, "BATCH_LINKS", most)
         followed_paths._remembered.clear()
         np.testing.assert_array_equal(path_gains(geometry), alone)
@@ -56,13 +56,6 @@ def test_parts_of_a_devices_links_change_nothing(geometry, monkeypatch):
         np.testing.assert_array_equal(each, other)
 
 
-def test_what_is_remembered_is_bounded(geometry, monkeypatch):
-    followed_paths._remembered.clear()
-    monkeypatch.setattr(followed_paths, "MAX_REMEMBERED_BYTES", 0)
-    path_gains(geometry)
-    assert len(followed_paths._remembered) == followed_paths.MIN_REMEMBERED
-
-
 def test_sectors_of_one_mast_are_followed_once(geometry, monkeypatch):
     """Two of the devices stand at one place; each had the other's paths forgotten."""
     asked, follow = [], followed_paths.path_powers
@@ -77,3 +70,6 @@ def test_sectors_of_one_mast_are_followed_once(geometry, monkeypatch):
     assert len(asked) == PLACES and sum(asked) == len(geometry)
     np.testing.assert_array_equal(path_gains(geometry), first)
     assert len(asked) == PLACES, "all is remembered"
+    monkeypatch.setattr(followed_paths, "MAX_REMEMBERED_BYTES", 0)
+    path_gains(geometry)
+    assert len(followed_paths._remembered) == followed_paths.MIN_REMEMBERED

@@ -75,8 +75,3 @@ def test_a_box_blocks_the_paths_that_go_through_it(geometry):
             of_link[link[path]] += power[path] * less
         assert (lost.others - lost.others_past >= 0.999 * of_link - 1e-9 * lost.others).all()
     assert 20 < blocked < 8 * 20 - 20
-
-
-def test_of_no_link_nothing_is_followed(geometry):
-    power = KnownPaths(geometry, geometry.city).powers_with_box(UprightBox((60.0, 0.0), (9.0, 9.0), 0.0, 60.0), np.arange(0))
-    assert [len(each) for each in power] == [0, 0, 0]

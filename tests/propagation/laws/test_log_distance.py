@@ -1,6 +1,5 @@
 """Log-distance laws of one line and of two, and a class that was hardly measured."""
 
-import warnings
 
 import numpy as np
 import pytest
@@ -57,13 +56,6 @@ def test_a_few_links_move_a_borrowed_line(world):
     assert abs((prior_db - data.mean_db[nlos]).mean()) > 8.0
 
 
-def test_enough_of_both_warns_of_nothing(world):
-    data = world(9, 400)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        SegmentedLogDistance().fit(data.links, data.level_db, -200.0)
-
-
 def test_one_line_recovers_its_own_law(world):
     def law(distance_m, los, elevation_rad):
         return -33.0 - 28.0 * np.log10(distance_m)
@@ -75,11 +67,3 @@ def test_one_line_recovers_its_own_law(world):
     mean_db, sigma_db = model.predict(data.links)
     assert np.sqrt(np.mean((mean_db - data.mean_db) ** 2)) < 0.25
     assert sigma_db.shape == (4000,)
-
-
-def test_line_of_sight_changes_nothing_for_one_line(world):
-    data = world(0, 500)
-    model = LogDistance().fit(data.links, data.level_db, None)
-    flipped = data.links.select(np.arange(500))
-    flipped.los[:] = ~flipped.los
-    assert np.array_equal(model.predict(flipped)[0], model.predict(data.links)[0])

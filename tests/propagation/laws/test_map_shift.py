@@ -64,13 +64,6 @@ def test_offsets_of_reflections_and_diffractions_are_found():
         assert abs((found[0] - found[1]) - (true_db[0] - true_db[1])) < 1.5
 
 
-def test_metal_in_place_of_concrete_is_an_offset():
-    receiver_m, device = flight(400, 4)
-    level_db = levels(houses(), receiver_m, device, 5)
-    reflected_db, _ = fit_offsets(links_over(houses(material="metal"), receiver_m, device), level_db, None, DIFFUSE)
-    assert -15 < reflected_db < -4
-
-
 @pytest.mark.parametrize("error, words", [
     (MapError(), ""), (MapError(wall_m=(0.5, 0, 1), offsets_db=(2.0, -2.0)), ""),
     (MapError(shift_m=(2.0, -1.0, 0.7)), r"lies \+2.0 m east and -1.0 m north .* within 0.7 m"),

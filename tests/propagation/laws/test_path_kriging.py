@@ -81,16 +81,6 @@ def test_paths_over_the_true_map_are_relied_on_and_a_map_of_another_place_is_not
         assert 0.8 < np.mean(np.abs(true_db - mean_db) < 1.645 * sd_db)
 
 
-@pytest.mark.slow
-def test_what_is_read_predicts_the_same(judged):
-    model, held, _ = judged[0]["wrong"]
-    data = encode_channel(model)
-    again, _ = decode_both(data, "test")
-    for one, other in zip(model.predict(held), again.predict(held)):
-        np.testing.assert_array_equal(one, other)
-    assert encode_channel(again) == data
-
-
 def test_a_damaged_file_is_refused():
     model = PathKriging()
     model.kriging.law = model.kriging.law.from_state({"lines": np.array([[-30.0, -2.0, 2.0]] * 2)}, {"borrowed": None})

@@ -53,13 +53,6 @@ def test_far_away_and_for_an_unmeasured_device_it_is_the_law(world):
     assert (model.predict(near)[1] < model.law.predict(near)[1]).all()
 
 
-def test_pure_noise_leaves_the_law_nearly_alone(world):
-    train, test = world(5, 900), world(6, 3000)
-    model = RegressionKriging().fit(train.links, train.level_db, None, seed=0)
-    difference_db = model.predict(test.links)[0] - model.law.predict(test.links)[0]
-    assert np.sqrt(np.mean(difference_db**2)) < 0.6
-
-
 def test_a_shadow_that_was_not_detected_stays_dark(world):
     """A disc of 80 m in which nothing arrives: predicted below the law there, and lower than if left out."""
     train = world(7, 2400)
@@ -77,14 +70,6 @@ def test_a_shadow_that_was_not_detected_stays_dark(world):
     law_db = model.law.predict(probe)[0]
     assert (model.predict(probe)[0] - law_db).mean() < -4.0
     assert model.predict(probe)[0].mean() < without.predict(probe)[0].mean() - 4.0
-
-
-def test_batches_do_not_show(world):
-    train, many = world(8, 300), world(9, 15_000)
-    model = RegressionKriging().fit(train.links, train.level_db + shadowing(train.links), None, seed=0)
-    whole = np.array(model.predict(many.links))
-    parts = [model.predict(many.links.select(slice(i, i + 777))) for i in range(0, 15_000, 777)]
-    assert np.allclose(whole, np.concatenate(parts, axis=1), atol=1e-9)
 
 
 def test_of_too_many_points_the_nearest_count(world, monkeypatch, tmp_path):
@@ -122,13 +107,6 @@ def test_where_devices_move_each_receiver_has_a_field(world):
     unmoved = RegressionKriging().fit(exchanged(data.links), level_db, None, seed=1)
     strange = exchanged(probe.links, moved=200)
     np.testing.assert_array_equal(unmoved.predict(strange)[0][1:], unmoved.law.predict(strange)[0][1:])
-
-
-def test_repeated_visits_become_one_point(world):
-    data = world(11, 40)
-    links = data.links.select(np.tile(np.arange(40), 5))
-    model = RegressionKriging().fit(links, np.tile(data.level_db, 5), None, seed=0)
-    assert sum(len(field.residual) for field in model.field.fields.values()) == 40
 
 
 def test_one_position_only(world):

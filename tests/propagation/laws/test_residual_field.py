@@ -52,14 +52,6 @@ def test_two_points_are_as_the_closed_form_says():
     assert np.array(field.predict(np.ones(1, int), np.zeros((1, 3)))).tolist() == [[0.0], [1.0]]
 
 
-def test_a_saved_field_predicts_the_same():
-    position_m, _, kind, value = drawn(3, 200)
-    field = ResidualField().fit(np.arange(200) % 3, position_m, value / value.std(), 0, kind)
-    again = ResidualField.from_state(*field.state())
-    series, other_m, kinds = np.arange(50) % 3, position_m[:50] + 7.0, kind[:50]
-    np.testing.assert_array_equal(field.predict(series, other_m, kinds), again.predict(series, other_m, kinds))
-
-
 def test_many_series_stay_within_the_memory_that_is_said(monkeypatch):
     """200 series of 150 points on fields of 60 m: coarser than measured, fitted to some, and the length is found."""
     monkeypatch.setattr(residual_field, "MAX_SERIES_TO_FIT", 20)

@@ -44,14 +44,6 @@ def test_two_walls_of_a_corner(inner_corner, line_of_slab):
     assert gain[0] == pytest.approx(abs(te_x * te_y) ** 2 / (2 * WAVE_NUMBER * length_m) ** 2, rel=1e-9)
 
 
-def test_beside_the_wall_is_no_reflection(inner_corner):
-    search, wall_x, _ = inner_corner
-    assert solve(search, [wall_x], -1, [-1], [20.0, 50.0, 5.0], [20.0, 65.0, 5.0])[0]
-    assert not solve(search, [wall_x], -1, [-1], [20.0, 50.0, 5.0], [20.0, 75.0, 5.0])[0]
-    assert not solve(search, [wall_x], -1, [-1], [20.0, 50.0, 18.0], [20.0, 50.0, 25.0])[0]
-    assert not solve(search, [wall_x], -1, [-1], [-20.0, 50.0, 5.0], [20.0, 55.0, 5.0])[0]
-
-
 def test_diffraction_and_reflection_after_the_edge(city_of):
     """Over a roof edge to a higher wall and back: angles to the edge are equal, and so are those to the wall."""
     search = CandidateSearch(city_of((0, -50, 5, 50, 10), (60, -50, 70, 50, 40)), depth=3)

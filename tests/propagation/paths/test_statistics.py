@@ -6,11 +6,9 @@ import pytest
 from radiotwin.propagation.paths.listing import (
     EDGE_TAPS,
     angular_spread_deg,
-    doppler_hz,
     impulse_response,
     k_factor_db,
     rms_spread,
-    sums,
 )
 
 # Two links: two paths of 0.8 and 0.2, 1 µs apart; one path alone. A third has none.
@@ -34,19 +32,6 @@ def test_angular_spread_does_not_depend_on_where_north_is(turned_rad):
     resultant = np.sqrt(0.8**2 + 0.2**2 + 2 * 0.8 * 0.2 * np.cos(np.radians(60)))
     spread = angular_spread_deg(angle, POWER, LINK, 3)
     assert spread == pytest.approx([np.degrees(np.sqrt(-2 * np.log(resultant))), 0, np.nan], abs=1e-5, nan_ok=True)
-
-
-def test_a_receiver_that_flies_towards_the_device_hears_a_higher_frequency():
-    towards, away, across = doppler_hz(np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0]]), np.array([15.0, 0, 0]), 0.125)
-    assert (towards, away, across) == (120, -120, 0)
-
-
-def test_paths_a_whole_number_of_taps_apart_keep_their_amplitudes():
-    amplitude = np.array([0.5j, -0.2, 0.1])
-    response = impulse_response(amplitude, np.array([0, 1e-6, 0]), LINK, 3, 10e6, 2 * EDGE_TAPS + 11)
-    assert np.flatnonzero(np.abs(response[0]) > 1e-12).tolist() == [EDGE_TAPS, EDGE_TAPS + 10]
-    assert response[0, EDGE_TAPS] == pytest.approx(0.5j) and response[0, EDGE_TAPS + 10] == pytest.approx(-0.2)
-    assert (np.abs(response) ** 2).sum(axis=1) == pytest.approx(sums(np.abs(amplitude) ** 2, LINK, 3))
 
 
 def test_energy_of_a_response_is_that_of_its_paths_and_the_sum_of_taps_their_field():

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from radiotwin.propagation.paths.candidates import CandidateSearch, _open_paths_to_edges
+from radiotwin.propagation.paths.candidates import CandidateSearch
 from radiotwin.propagation.paths.pruning import narrow, open_window
 
 
@@ -49,15 +49,3 @@ def _through(planes, facet, mirrors, start_m, ray):
     far = ((origin_m - start_m) @ axes[0]) / (ray @ axes[0])
     u, v = ((start_m + far[:, None] * ray - origin_m) @ axes[1:].T).T
     return (far > 1e-9) & (u > 0) & (v > 0) & (u < planes[facet, 13]) & (v < planes[facet, 14])
-
-
-def test_only_edges_that_the_device_sees_are_tried(city_of):
-    """A box behind a higher one is hidden, except for what looks out above or beside it; of the near one the device sees three edges."""
-    city = city_of((0, -20, 5, 20, 30), (30, -10, 40, 10, 10), (30, 100, 40, 120, 10))
-    search = CandidateSearch(city, 1)
-    everything = np.arange(len(search.surfaces.edges))
-    ways = _open_paths_to_edges(city, search.surfaces, np.full((len(everything), 1), -1), everything, np.array([-20.0, 0, 1.5]))
-    middle_m = search.facets.edge_ends_m[ways.edge].mean(axis=1)
-    assert set(np.unique(ways.edge)) < set(everything) and len(np.unique(ways.edge)) == len(ways.edge)
-    hidden = (middle_m[:, 0] > 25) & (np.abs(middle_m[:, 1]) < 50)
-    assert not hidden.any() and (middle_m[:, 1] > 50).any() and (middle_m[:, 0] < 10).sum() == 3
