@@ -9,16 +9,17 @@ over a map with guessed heights), that direction is used.
 """
 
 import math
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
 from radiotwin.effects.arrays import frequent_labels, one_hot
-from radiotwin.effects.base import Effect, GainEffect, LevelAt, Term
+from radiotwin.effects.base import Effect, GainEffect, LevelAt, ResidualView, Term
 from radiotwin.effects.params import (
     Allowed,
     DeviceIndex,
@@ -98,6 +99,35 @@ class BodyFrameEffect(GainEffect):
     settled_by = "fly the same track in both directions"
     figure = "pattern"
     of_receiver = True
+    arrivals: ClassVar[Any]  # links, rows -> their arrivals, with a `gain_db(pattern)`
+    params: Any
+
+    @abstractmethod
+    def usable(self, links: Links) -> np.ndarray:
+        """Return the mask (n,) of links that patterns are fitted to."""
+
+    @abstractmethod
+    def best_pattern(self, view: ResidualView, rows: np.ndarray) -> EffectParams | None:
+        """Find the pattern that fits links of one receiver best; None if it gains little."""
+
+    @override
+    def propose(self, view: ResidualView) -> list[Any]:
+        """Propose the pattern of each receiver where one fits its residuals clearly."""
+        usable, receiver = self.usable(view.links), view.links.receiver
+        found = {member: self.best_pattern(view, np.flatnonzero((receiver == member) & usable))
+                 for member in frequent_labels(receiver[usable], MIN_LINKS)}
+        found = {member: pattern for member, pattern in found.items() if pattern is not None}
+        return [self.Params.model_validate({"receivers": found})] if found else []
+
+    @override
+    def gain_db(self, links: Links) -> np.ndarray:
+        """Compute the gain (n,) by the receivers' patterns on each link [dB]."""
+        gain_db = np.zeros(len(links))
+        for receiver, pattern in self.params.receivers.items():
+            rows = np.flatnonzero((links.receiver == receiver) & np.isfinite(links.heading_deg))
+            arrivals = self.of_links.get(links, receiver, partial(self.arrivals, links, rows))
+            gain_db[rows] = arrivals.gain_db(pattern)
+        return gain_db
 
     @override
     def unavailable(self, links: Links) -> str | None:

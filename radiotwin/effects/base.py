@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Protocol, 
 
 import numpy as np
 
-from radiotwin.effects.arrays import LinkCache
+from radiotwin.effects.arrays import LinkCache, add_power
 from radiotwin.effects.params import (
     Allowed,
     EffectParams,
@@ -142,6 +142,7 @@ class Effect(ABC):
         always_exact: whether every candidate may be refined by `exactly`, not only the kept ones.
         uses: columns of the measurements that it reads and that maps lack, e.g. `quality`.
         needs_map: whether its term needs the 3D map.
+        needs_frequency: whether its term needs the frequency.
         settled_by: measurement that would confirm or exclude it; "the device" is replaced by the
             device's name.
         parameter_labels: printed names of reported parameters (without the member), if not made
@@ -174,6 +175,7 @@ class Effect(ABC):
     always_exact: ClassVar[bool] = False
     uses: ClassVar[tuple[str, ...]] = ()
     needs_map: ClassVar[bool] = False
+    needs_frequency: ClassVar[bool] = False
     settled_by: ClassVar[str] = ""
     parameter_labels: ClassVar[Mapping[str, str]] = {}
     acts_on: ClassVar[tuple[str, ...]] = ()
@@ -231,9 +233,13 @@ class Effect(ABC):
     def unavailable(self, links: Links) -> str | None:
         """Return why the links do not allow a search for this effect; None if they do.
 
-        By default: the effect needs a map, and there is none.
+        By default: the effect needs a map or the frequency, and there is none.
         """
-        return "there is no 3D map" if self.needs_map and links.city is None else None
+        if self.needs_map and links.city is None:
+            return "there is no 3D map"
+        if self.needs_frequency and not np.isfinite(links.frequency_hz):
+            return "the frequency is not known; give frequency_hz in devices.csv"
+        return None
 
     def kind(self) -> Any:
         """Return a label of its kind of parameters; the search starts once from each kind."""
@@ -246,7 +252,7 @@ class Effect(ABC):
         """
         return [self.Params()]
 
-    def propose_like(self, view: ResidualView) -> list[Any]:
+    def propose_for_fold(self, view: ResidualView) -> list[Any]:
         """Propose parameters for one fold, given that all links led to this effect."""
         return self.propose(view)
 
@@ -334,7 +340,7 @@ class Effect(ABC):
         """Return why the map of the links contradicts the fitted effect; None if it does not."""
         return None
 
-    def same_as(self, links: Links, parameters: Mapping[str, Parameter]) -> list[str]:
+    def rivals(self, links: Links, parameters: Mapping[str, Parameter]) -> list[str]:
         """List the effects that would explain these links equally well by name; default: none.
 
         E.g. an offset of a device that only one receiver heard may as well be that receiver's.
@@ -395,13 +401,15 @@ class GainEffect(Effect):
 
 
 class _ResponseEffect(Effect):
-    """An effect with a response, level in -> level out; override `inputs`, or `term`."""
+    """An effect with a response, level in -> level out; override `inputs`, or `term`.
+
+    By default it adds a power, its inputs (n,), linear; 1 is 0 dB.
+    """
 
     def inputs(self, links: Links) -> np.ndarray:
         """Compute the inputs (n, …) of `response` for each link."""
         raise NotImplementedError(f"{type(self).__name__} defines neither inputs nor term")
 
-    @abstractmethod
     def response(self, level_db: np.ndarray, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Map the mean levels that enter this stage of reception to those that leave it.
 
@@ -412,6 +420,7 @@ class _ResponseEffect(Effect):
         Returns:
             (n,) level that leaves [dB], and (n,) its derivative by `level_db`, positive.
         """
+        return add_power(level_db, inputs)
 
     def term(self, links: Links, level_at: LevelAt) -> Term:
         """Return a term that adds 0 dB and carries the inputs."""

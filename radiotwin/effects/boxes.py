@@ -25,7 +25,7 @@ P_MISS = 0.4  # probability that a link through a cell misses the box in it, whi
 MIN_SHARE = 0.1  # share of the links through a box below which they count as none
 GRAZING_DB = 6.0  # loss at a knife edge that the ray just touches
 SAME_PLACE_M = 10.0  # largest distance between devices of one mast
-BESIDE_UNKNOWN = ("only links of devices whose positions are estimated pass it: they may be "
+ESTIMATED_PLACES = ("only links of devices whose positions are estimated pass it: they may be "
                   "elsewhere")
 WELD_M = 0.05  # vertices closer together belong to one building
 
@@ -196,7 +196,7 @@ def devices_through(box: Box, links: Links) -> np.ndarray:
     return np.bincount(links.device[inside], minlength=len(links.device_m))
 
 
-def is_beside_unknown(through: np.ndarray, links: Links) -> bool:
+def is_seen_from_estimated_places(through: np.ndarray, links: Links) -> bool:
     """Check whether nearly all links through a box belong to devices of estimated position.
 
     Args:

@@ -27,7 +27,7 @@ class MovedEnd(GainEffect):
     params: Any
 
     @override
-    def propose_like(self, view: ResidualView) -> list[Any]:
+    def propose_for_fold(self, view: ResidualView) -> list[Any]:
         rows = np.isin(np.arange(len(view.links)), self.rows(view.links))
         return self.propose(view.of_group(rows)) if rows.sum() >= MIN_LINKS else []
 

@@ -13,10 +13,20 @@ from tests.worlds import make_links, open_ground, shortened
 __all__ = ["make_links", "open_ground"]
 
 
+def with_params(effect, levels=None, **params):
+    """Return an effect of a class with these parameters."""
+    return effect().with_params(effect.Params(**params), levels)
+
+
+def law_db(links, exact=False):
+    return -40 - 22 * np.log10(links.distance_m)
+
+
 @pytest.fixture
 def view():
     """Make the view of links whose predicted levels (n,) and whose scale of the errors [dB] are known."""
-    def make(links, mean_db, scale_db, level_at=None):
+    def make(links, mean_db=0.0, scale_db=1.0, level_at=None):
+        mean_db = np.broadcast_to(mean_db, len(links))
         excess_db = np.where(np.isfinite(links.limit_db), links.limit_db - mean_db, 0.0)
         residual_db = np.where(np.isnan(links.level_db), np.minimum(excess_db, 0.0),
                                links.level_db - mean_db)

@@ -1,4 +1,4 @@
-"""Boxes in the way of links, against hand-made cases and points along each link."""
+"""Boxes in the way of links, against hand-made cases and points along each link; buildings of a map."""
 
 import tracemalloc
 
@@ -8,13 +8,18 @@ import pytest
 from radiotwin.effects import boxes
 from radiotwin.effects.boxes import (
     CELL_M,
+    HEIGHT_SD_M,
     HEIGHTS_M,
     Box,
     back_project,
+    building_extents_m,
+    building_height_sds_m,
+    buildings,
     cross,
     knife_edge_db,
     two_edges_db,
 )
+from tests.worlds import city_of_boxes
 
 
 def inside(box, points_m):
@@ -120,13 +125,28 @@ def test_back_projection_finds_the_cell_and_how_high_it_must_be():
 def test_a_straightened_box_is_the_same_with_a_smaller_turn(turn_deg):
     box = Box(3.0, -4.0, 20.0, 10.0, 5.0, turn_deg)
     straight = box.straightened()
-
-    def corners(of):
-        turn = np.radians(of.turn_deg)
-        axes = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
-        signs = np.array([(1, 1), (1, -1), (-1, 1), (-1, -1)])
-        return np.array(sorted((signs * [of.length_m / 2, of.width_m / 2] @ axes).round(6).tolist()))
-
     assert abs(straight.turn_deg) <= 45 and straight.straightened() == straight
-    np.testing.assert_allclose(corners(straight), corners(box), atol=1e-5)
-    assert straight._replace(length_m=0, width_m=0, turn_deg=0) == box._replace(length_m=0, width_m=0, turn_deg=0)
+    corners = [np.array(sorted(each.outline_m[:4].round(6).tolist())) for each in (straight, box)]
+    np.testing.assert_allclose(*corners, atol=1e-5)
+    assert straight.height_m == box.height_m
+
+
+BOUNDS_M = [[[0, 0, 0], [20, 10, 12]], [[40, 0, 0], [50, 30, 25]]]
+
+
+def test_each_block_is_a_building_with_its_extents():
+    city = city_of_boxes(*BOUNDS_M)
+    label, centres_m = buildings(city)
+    assert sorted(np.bincount(label)) == [12, 12]
+    assert sorted(map(tuple, centres_m.tolist())) == [(10.0, 5.0, 12.0), (45.0, 15.0, 25.0)]
+    low_m, high_m = building_extents_m(city, label)
+    order = np.argsort(centres_m[:, 0])
+    np.testing.assert_allclose(np.stack([low_m, high_m], axis=1)[order], BOUNDS_M)
+
+
+def test_a_height_is_known_as_well_as_its_map_says():
+    told = city_of_boxes(*BOUNDS_M, height_sd_m=np.repeat([6.5, np.nan], 12))
+    first = np.argsort(buildings(told)[1][:, 0])
+    assert building_height_sds_m(told)[first].tolist() == [6.5, HEIGHT_SD_M]
+    for height_sd_m in (np.full(24, 0.5), None):
+        assert building_height_sds_m(city_of_boxes(*BOUNDS_M, height_sd_m=height_sd_m)).tolist() == [HEIGHT_SD_M] * 2

@@ -23,11 +23,6 @@ def test_the_loss_has_the_reference_values(ghz, elevation_deg, building, values)
     assert found == pytest.approx(values, abs=0.01)
 
 
-def test_the_elevation_counts_to_either_side():
-    up, down = (entry_loss_db(2.4e9, sign * 60.0, "traditional") for sign in (1, -1))
-    assert up == down > entry_loss_db(2.4e9, 0.0, "traditional") + 10
-
-
 @pytest.fixture
 def indoors(make_links):
     """A device in the street; 40 receivers inside a block, 40 outside it."""
@@ -82,13 +77,6 @@ def test_loss_and_scatter_are_found(make_links):
                       params.scatter_sd_db))
     loss_db, scatter_db = np.mean(found, axis=0)
     assert loss_db == pytest.approx(12.0, abs=2.5) and scatter_db == pytest.approx(6.0, abs=2.0)
-
-
-def test_it_needs_a_map_a_frequency_and_links_indoors(indoors, make_links):
-    assert "no 3D map" in BuildingEntry().unavailable(make_links([[0.0, 0, 1.5]], np.ones((60, 3))))
-    assert "frequency" in BuildingEntry().unavailable(make_links([[0.0, 0, 1.5]], np.ones((60, 3)), city=indoors.city,
-                                                                 frequency_hz=np.nan))
-    assert "0 links" in BuildingEntry().unavailable(indoors.select(np.arange(80) >= 40))
 
 
 @pytest.mark.parametrize("more_db, message", [(0.0, None), (-30.0, "amplify"), (-15.0, "lose 0.2 dB only"), (60.0, "99 %")])

@@ -12,6 +12,7 @@ from radiotwin.propagation.laws.log_distance import LogDistance
 from radiotwin.twin.model import fitting
 from radiotwin.twin.model.fitting import add_effect, along_paths
 from radiotwin.twin.model.model import Model
+from tests.effects.conftest import with_params
 from tests.worlds import city_of_boxes
 
 FAR_M, NEAR_M = [-300.0, 300, 60], [60.0, 0, 10]
@@ -40,16 +41,15 @@ def links(make_links):
 
 
 def test_links_near_a_removed_building_have_the_level_without_it(links):
-    channel, effect = CountingChannel(), RemovedObstacle()
-    building = int(only_blocker(links)[0])
-    exactly = effect.with_params(effect.Params(building=building, centre_m=(0.0, 0.0, 40.0))).exactly()
+    channel, building = CountingChannel(), int(only_blocker(links)[0])
+    exactly = with_params(RemovedObstacle, building=building, centre_m=(0.0, 0.0, 40.0)).exactly()
     np.testing.assert_allclose(exactly.term(links, channel).offset_db, [20.0, 0.0], atol=0.01)
     assert channel.links == 2  # one link, before and after
 
 
 def test_a_missing_building_is_in_the_map_that_the_channel_predicts_over(links):
-    channel, effect = CountingChannel(), MissingObstacle()
-    exactly = effect.with_params(effect.Params(box=(30.0, 0.0, 10.0, 30.0, 25.0, 90.0))).exactly()
+    channel = CountingChannel()
+    exactly = with_params(MissingObstacle, box=(30.0, 0.0, 10.0, 30.0, 25.0, 90.0)).exactly()
     np.testing.assert_allclose(exactly.term(links, channel).offset_db, [-30.0, 0.0], atol=0.01)
     assert channel.links == 2
     variation = exactly.variation()
@@ -60,10 +60,10 @@ def test_a_missing_building_is_in_the_map_that_the_channel_predicts_over(links):
 
 
 @pytest.mark.parametrize(("effect", "params"), [
-    (DevicePositionError(), {"device": 0, "move_m": (0.0, 60.0)}),
-    (ReceiverPositionError(), {"receiver": 0, "move_m": (0.0, 60.0, 0.0)})])
+    (DevicePositionError, {"device": 0, "move_m": (0.0, 60.0)}),
+    (ReceiverPositionError, {"receiver": 0, "move_m": (0.0, 60.0, 0.0)})])
 def test_a_moved_end_has_the_level_of_its_true_position(links, effect, params):
-    exactly = effect.with_params(effect.Params(**params)).exactly()
+    exactly = with_params(effect, **params).exactly()
     offset_db = exactly.term(links, CountingChannel()).offset_db
     assert offset_db[0] == pytest.approx(20 - 0.1 * (np.hypot(120, 60) - 120), abs=0.01) and abs(offset_db[1]) > 1
     assert exactly.variation().follows_paths
@@ -73,8 +73,7 @@ def test_at_another_time_a_receiver_is_elsewhere_along_its_way(make_links):
     """Ten metres a second to the north: six seconds later it no longer looks through the building."""
     way_m = [[60.0, 10.0 * slot, 10] for slot in range(12)]
     links = make_links([[-60.0, 0, 10]], way_m, city=boxes((0, 0)), time_s=np.arange(12.0))
-    effect = ReceiverClockOffset()
-    exactly = effect.with_params(effect.Params(receiver=0, offset_s=6.0, speed_m_s=10.0)).exactly()
+    exactly = with_params(ReceiverClockOffset, receiver=0, offset_s=6.0, speed_m_s=10.0).exactly()
     offset_db = exactly.term(links, CountingChannel()).offset_db
     assert offset_db[0] == pytest.approx(20 - 0.1 * (np.hypot(120, 60) - 120), abs=0.01)
     assert exactly.variation().follows_paths

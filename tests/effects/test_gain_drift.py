@@ -10,16 +10,23 @@ SLOTS, FLIGHT_S = 200, 300.0
 
 
 @pytest.fixture
-def flown(make_links):
-    """Make links of two receivers on four flights of 50 slots each, which start 300 s apart at 1000 s."""
-    def make():
+def flying(make_links):
+    """Make links of receivers on four flights of 50 slots each, which start 300 s apart at 1000 s."""
+    def make(device_m, receivers):
         flight = np.arange(SLOTS) // 50
         time_s = 1000 + FLIGHT_S * flight + 2.0 * (np.arange(SLOTS) % 50)
         # At random positions: along a slow track, a drift looks like spatially correlated errors.
         receiver_m = np.column_stack([np.random.default_rng(0).uniform(0, 900, (SLOTS, 2)), np.full(SLOTS, 50.0)])
-        return make_links([[0.0, 0, 1.5]], np.repeat(receiver_m, 2, axis=0), receiver=np.tile([0, 1], SLOTS),
-                          flight=np.repeat(flight, 2), time_s=np.repeat(time_s, 2))
+        each = receivers * len(device_m)
+        return make_links(device_m, np.repeat(receiver_m, receivers, axis=0), flight=np.repeat(flight, each),
+                          receiver=np.repeat(np.tile(np.arange(receivers), SLOTS), len(device_m)),
+                          time_s=np.repeat(time_s, each))
     return make
+
+
+@pytest.fixture
+def flown(flying):
+    return flying([[0.0, 0, 1.5]], 2)
 
 
 SHAPES = {
@@ -32,7 +39,7 @@ SHAPES = {
 
 @pytest.mark.parametrize("form", SHAPES)
 def test_a_form_has_its_shape_on_its_receivers_links_only(flown, form):
-    links, (number, shape) = flown(), SHAPES[form]
+    links, (number, shape) = flown, SHAPES[form]
     term = ReceiverDrift().with_params(ReceiverDrift.Params(receivers={1: Drift(form, number)})).term(links, None)
     mine = links.receiver == 1
     np.testing.assert_allclose(term.columns[mine, 0], shape(links.time_s, links.flight)[mine], atol=1e-9)
@@ -42,11 +49,11 @@ def test_a_form_has_its_shape_on_its_receivers_links_only(flown, form):
 
 @pytest.mark.parametrize("form", SHAPES)
 def test_the_true_form_is_proposed_for_the_receiver_that_has_it(flown, view, form):
-    links, (number, shape) = flown(), SHAPES[form]
+    links, (number, shape) = flown, SHAPES[form]
     rng = np.random.default_rng(0)
     links.level_db[:] = rng.normal(0, 0.5, len(links)) \
         + np.where(links.receiver == 1, 6 * shape(links.time_s, links.flight), 0.0)
-    (params,) = ReceiverDrift().propose(view(links, np.zeros(len(links)), 1.0))
+    (params,) = ReceiverDrift().propose(view(links))
     assert list(params.receivers) == [1]
     found, value = params.receivers[1]
     assert found == form and value == pytest.approx(number, rel=0.5 if "warm" in form else 0.01)
@@ -56,18 +63,10 @@ def test_the_true_form_is_proposed_for_the_receiver_that_has_it(flown, view, for
         np.testing.assert_allclose(column, (two.time_s - value) / 998, atol=1e-9)  # from 1000 to 1998 s
 
 
-def test_without_times_there_is_no_drift(make_links):
-    assert "time_s" in ReceiverDrift().unavailable(make_links([[0.0, 0, 1.5]], np.ones((80, 3))))
-
-
-
 @pytest.fixture
-def heard(make_links):
-    """Links of one receiver and three devices on four flights, of the third device on the first two only."""
-    flight = np.arange(SLOTS) // 50
-    receiver_m = np.column_stack([np.random.default_rng(0).uniform(0, 900, (SLOTS, 2)), np.full(SLOTS, 50.0)])
-    every = make_links([[0.0, 0, 1.5], [300, 0, 1.5], [0, 300, 1.5]], receiver_m, flight=np.repeat(flight, 3),
-                       time_s=np.repeat(1000 + FLIGHT_S * flight + 2.0 * (np.arange(SLOTS) % 50), 3))
+def heard(flying):
+    """Links of one receiver and three devices, of the third device on the first two flights only."""
+    every = flying([[0.0, 0, 1.5], [300, 0, 1.5], [0, 300, 1.5]], 1)
     return every.select((every.device < 2) | (every.flight < 2))
 
 
@@ -75,7 +74,7 @@ def heard(make_links):
 def test_a_device_that_ages_or_has_changed_is_proposed_and_mapped_in_its_latest_state(heard, view, form, shape):
     rng = np.random.default_rng(0)
     heard.level_db[:] = rng.normal(0, 0.5, len(heard)) - np.where(heard.device == 1, 6 * shape(heard.time_s), 0.0)
-    (params,) = DeviceDrift().propose(view(heard, np.zeros(len(heard)), 1.0))
+    (params,) = DeviceDrift().propose(view(heard))
     assert list(params.devices) == [1] and params.devices[1].form == form
     # A map has no time: it is of the latest state.
     timeless = heard.with_columns(time_s=np.full(len(heard), np.nan))
@@ -88,9 +87,8 @@ def test_a_device_that_ages_or_has_changed_is_proposed_and_mapped_in_its_latest_
 def test_no_drift_is_proposed_for_a_device_heard_on_few_flights(heard, view):
     heard.level_db[:] = np.random.default_rng(0).normal(0, 0.5, len(heard)) \
         - np.where((heard.device == 2) & (heard.time_s > 1310), 6.0, 0.0)
-    assert DeviceDrift().propose(view(heard, np.zeros(len(heard)), 1.0)) == []
+    assert DeviceDrift().propose(view(heard)) == []
     assert "on 3 flights" in DeviceDrift().unavailable(heard.select(heard.flight < 2))
-
 
 
 def test_a_time_constant_is_refined_on_a_logarithmic_scale():

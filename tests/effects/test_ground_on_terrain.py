@@ -8,6 +8,7 @@ from radiotwin.effects.catalogue.ground_reflection import bounces_on_terrain, tw
 from radiotwin.effects.catalogue.interference import Interference
 from radiotwin.effects.catalogue.missing_obstacle import _with_box
 from radiotwin.effects.catalogue.removed_obstacle import RemovedObstacle, only_blocker
+from tests.effects.conftest import with_params
 from tests.terrains import incline, ridge, terrain_map
 
 
@@ -69,6 +70,5 @@ def test_an_emitter_stands_on_the_ground(make_links):
         asked_m.append(moved.device_m)
         return np.zeros(len(moved))
 
-    emitter = Interference()
-    emitter.with_params(emitter.Params(place_m=(0.0, 0.0), level_db=0.0, within_m=(-9, -9, 9, 9), through_channel=True)).term(links, level_at)
+    with_params(Interference, place_m=(0.0, 0.0), level_db=0.0, within_m=(-9, -9, 9, 9), through_channel=True).term(links, level_at)
     np.testing.assert_allclose(asked_m, [[[0.0, 0.0, float(links.city.ground_height_m(0.0, 0.0)) + 1.5]]])

@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 
 from radiotwin.effects.catalogue.interference import Interference
+from tests.effects.conftest import with_params
 from tests.worlds import city_of_boxes
+
+EMITTER = {"place_m": (120.0, 80.0), "level_db": -90.0, "within_m": (0, 0, 300, 300)}
 
 
 def watts(level_db):
@@ -19,13 +22,12 @@ def heard(receiver_m, emitter_m, level_db):
 def test_powers_add_and_the_slope_is_known(make_links):
     rng = np.random.default_rng(0)
     links = make_links([[0.0, 0, 1.5], [90, 40, 1.5]], np.column_stack([rng.uniform(0, 300, (50, 2)), np.full(50, 60.0)]))
-    params = Interference.Params(place_m=(120.0, 80.0), level_db=-90.0, within_m=(0, 0, 300, 300))
-    level_db = rng.uniform(-120, -60, len(links))
-    inputs = Interference().with_params(params).term(links, None).inputs
-    read_db, slope = Interference().with_params(params).response(level_db, inputs)
+    level_db, emitter = rng.uniform(-120, -60, len(links)), with_params(Interference, **EMITTER)
+    inputs = emitter.term(links, None).inputs
+    read_db, slope = emitter.response(level_db, inputs)
     power = heard(links.receiver_m, np.array([120.0, 80.0, 1.5]), -90.0)
     np.testing.assert_allclose(watts(read_db), watts(level_db) + power, rtol=1e-9)
-    more_db, less_db = (Interference().with_params(params).response(level_db + step, inputs)[0] for step in (1e-4, -1e-4))
+    more_db, less_db = (emitter.response(level_db + step, inputs)[0] for step in (1e-4, -1e-4))
     np.testing.assert_allclose(slope, (more_db - less_db) / 2e-4, atol=1e-6)
 
 
@@ -39,18 +41,16 @@ def test_beside_a_node_that_sends_nothing_raises_a_gateway(make_links):
     """Where devices read the levels their places count, and two gateways cannot locate an emitter."""
     receiver_m = np.column_stack([np.arange(40) * 30.0, np.zeros(40), np.full(40, 20.0)])
     links = make_links([[0.0, 0, 30.0], [600.0, 50, 30.0]], receiver_m)
-    params = Interference.Params(place_m=(120.0, 80.0), level_db=-90.0, within_m=(0, 0, 300, 300))
     assert Interference().unavailable(links) is None
     uplink = links.with_ends(reads=np.array([True, True]))
     assert "read at 2 positions" in Interference().unavailable(uplink)
-    power = Interference().with_params(params).term(uplink, None).inputs
+    power = with_params(Interference, **EMITTER).term(uplink, None).inputs
     np.testing.assert_allclose(power, heard(links.device_m[links.device], np.array([120.0, 80.0, 1.5]), -90.0))
 
 
 def test_an_emitter_at_the_edge_of_the_searched_area_is_implausible():
-    params = Interference.Params(place_m=(300.0, 80.0), level_db=-90.0, within_m=(0, 0, 300, 300))
-    assert "edge" in Interference().with_params(params).implausible(np.zeros(0))
-    assert Interference().with_params(params.model_copy(update={"place_m": (250.0, 80.0)})).implausible(np.zeros(0)) is None
+    edge, inside = (with_params(Interference, **EMITTER | {"place_m": (x_m, 80.0)}) for x_m in (300.0, 250.0))
+    assert "edge" in edge.implausible(np.zeros(0)) and inside.implausible(np.zeros(0)) is None
 
 
 @pytest.mark.slow
@@ -88,8 +88,8 @@ def walled_level_db(links, exact=False):
 def test_over_a_map_its_power_falls_as_that_of_a_device(make_links, walled):
     receiver_m = np.array([[50.0, 80, 30], [250.0, 80, 30], [250.0, 80, 400]])  # beside it, behind the wall, above it
     links = make_links([[0.0, 0, 1.5], [0.0, 200, 20.0]], receiver_m, city=walled)
-    params = Interference.Params(place_m=(120.0, 80.0), level_db=-10.0, within_m=(0, 0, 300, 300), through_channel=True)
-    power = Interference().with_params(params).term(links, walled_level_db).inputs
+    emitter = with_params(Interference, **EMITTER | {"level_db": -10.0, "through_channel": True})
+    power = emitter.term(links, walled_level_db).inputs
     expected = heard(links.receiver_m, np.array([120.0, 80.0, 1.5]), -40.0 - 40.0 - 10.0)
     np.testing.assert_allclose(10 * np.log10(power / expected), np.where(links.receiver_m[:, 2] == 400, 0, np.where(
         links.receiver_m[:, 0] == 250, -17, 0)), atol=1e-9)
@@ -113,6 +113,5 @@ def test_a_part_of_the_links_is_searched_where_all_of_them_found_it(make_links, 
     """A part whose own links propose nothing, as the emitter is far below the level there, still tries it."""
     rng = np.random.default_rng(0)
     links = make_links([[0.0, 0, 1.5]], np.column_stack([rng.uniform(0, 300, (60, 2)), np.full(60, 60.0)]))
-    params = Interference.Params(place_m=(120.0, 80.0), level_db=-190.0, within_m=(0, 0, 300, 300))
-    seen = view(links, np.zeros(60), 2.0)
-    assert Interference().propose(seen) == [] and Interference().with_params(params).propose_like(seen) == [params]
+    weak, seen = with_params(Interference, **EMITTER | {"level_db": -190.0}), view(links, 0.0, 2.0)
+    assert Interference().propose(seen) == [] and weak.propose_for_fold(seen) == [weak.params]

@@ -13,6 +13,7 @@ from radiotwin.propagation.laws.image_paths import ImagePaths
 from radiotwin.scene.vegetation import Vegetation, VegetationConfig
 from radiotwin.twin.model.fitting import along_paths, refine
 from radiotwin.twin.model.model import Model
+from tests.effects.conftest import with_params
 from tests.worlds import city_of_boxes
 
 HOUSE_M = [[200, 0, 0], [230, 30, 12]]
@@ -22,8 +23,7 @@ FIELD_M = np.array([(x_m, y_m, 5.0) for x_m in range(90, 200, 6) for y_m in rang
 
 
 def with_box(box, levels="quick", **params):
-    effect = MissingObstacle()
-    return effect.with_params(effect.Params(box=box, **params), levels)
+    return with_params(MissingObstacle, levels, box=box, **params)
 
 
 def gain_nats(residual, params):
@@ -113,22 +113,18 @@ def test_a_box_in_a_building_of_the_map_or_along_its_wall_is_no_missing_building
     assert with_box(box).contradicted(make_links([[0.0, 0, 2.0]], [[100.0, 0, 20.0]])) is None, "without a map"
 
 
-@pytest.mark.parametrize("effect", [MissingObstacle(), Foliage()])
-def test_what_hides_devices_that_may_be_elsewhere_alone_is_refused(make_links, effect):
+@pytest.mark.parametrize(("effect", "second_m", "known", "why"), [
+    (MissingObstacle, [5.0, -15.0, 2.0], {0, 1, 2}, ""), (Foliage, [5.0, -15.0, 2.0], {0, 1, 2}, ""),
+    (MissingObstacle, [5.0, -15.0, 2.0], {2}, "may be elsewhere"), (Foliage, [5.0, -15.0, 2.0], {2}, "may be elsewhere"),
+    (MissingObstacle, [5.0, -15.0, 2.0], {0}, ""), (Foliage, [5.0, -15.0, 2.0], {0}, ""),
+    (MissingObstacle, [0.0, 1.0, 12.0], {0, 1, 2}, "seen from one place"),  # on the same mast
+    (MissingObstacle, [0.0, 90.0, 2.0], {0, 1, 2}, "seen from one place")])  # has nothing to do with the box
+def test_what_stands_before_uncertain_devices_or_one_place_only_is_refused(make_links, effect, second_m, known, why):
+    """The first device is behind the box, the third has nothing to do with it."""
     receiver_m = np.column_stack([np.linspace(90, 110, 20), np.zeros(20), np.full(20, 20.0)])
-    links = make_links([[0.0, 0, 2.0], [5.0, -15.0, 2.0], [0.0, 80.0, 2.0]], receiver_m)
-    params = effect.Params(box=Box(20.0, -5.0, 10.0, 20.0, 10.0, 0.0))  # before devices 0 and 1
-    for known, refused in (({0, 1, 2}, False), ({2}, True), ({0}, False)):
-        why = effect.with_params(params).contradicted(links.with_ends(anchors=frozenset(known)))
-        assert ("may be elsewhere" in (why or "")) == refused and bool(why) == refused
-
-
-@pytest.mark.parametrize("other_m, refused", [([5.0, -15.0, 2.0], False), ([0.0, 1.0, 12.0], True), ([0.0, 90.0, 2.0], True)])
-def test_a_box_that_is_seen_from_one_place_is_no_building(make_links, other_m, refused):
-    """The other device stands elsewhere, on the same mast, or has nothing to do with the box."""
-    receiver_m = np.column_stack([np.linspace(90, 110, 20), np.zeros(20), np.full(20, 20.0)])
-    links = make_links([[0.0, 0, 2.0], other_m], receiver_m)
-    assert bool(with_box(Box(20.0, -5.0, 10.0, 20.0, 16.0, 0.0)).contradicted(links)) == refused
+    links = make_links([[0.0, 0, 2.0], second_m, [0.0, 80.0, 2.0]], receiver_m).with_ends(anchors=frozenset(known))
+    found = with_params(effect, box=Box(20.0, -5.0, 10.0, 20.0, 16.0, 0.0)).contradicted(links) or ""
+    assert why in found and bool(found) == bool(why)
 
 
 def test_a_search_may_stay_where_it_begins():
@@ -199,8 +195,6 @@ def test_where_a_building_was_found_no_other_is_proposed(make_links, view):
     assert np.hypot(box.x_m - 60, box.y_m) < 25
     found = replace(residual, found=(MissingObstacle().with_params(before[0]),))
     x_m, y_m = np.meshgrid(np.linspace(-100, 300, 801), np.linspace(-200, 200, 801))
-    again = MissingObstacle().propose(found)
-    for params in again:
-        shared = (stands_on(box, x_m, y_m) & stands_on(params.box, x_m, y_m)).sum()
-        assert shared <= 0.3 * stands_on(params.box, x_m, y_m).sum()
-    assert box not in [each.box for each in again]
+    for params in MissingObstacle().propose(found):
+        again = stands_on(params.box, x_m, y_m)
+        assert (stands_on(box, x_m, y_m) & again).sum() <= 0.3 * again.sum()

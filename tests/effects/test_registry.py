@@ -11,6 +11,10 @@ import pytest
 
 from radiotwin.effects import GainEffect, catalogue, effect_named, register, registry
 from radiotwin.errors import BadInput
+from tests.worlds import city_of_boxes
+
+NEAR_M = np.random.default_rng(0).uniform(20, 90, (100, 3))
+FAR_HOUSE = {"city": city_of_boxes([[400, 400, 0], [420, 420, 30]])}
 
 
 class Hail(GainEffect):
@@ -52,26 +56,25 @@ def test_a_broken_one_warns_and_the_rest_works(installed):
     assert "broken" in first and "no_such_module" in first and "no_effect" in second
 
 
-@pytest.mark.parametrize("effect", registry.BUILT_IN, ids=lambda effect: f"{effect.name}-{effect.variant}")
-def test_every_effect_can_be_sent_to_another_process(effect):
+@pytest.mark.parametrize("effect", registry.BUILT_IN, ids=lambda effect: effect.__name__)
+def test_every_effect_can_be_sent_to_another_process_and_describes_its_parameters(effect):
     assert type(cloudpickle.loads(cloudpickle.dumps(effect()))) is effect
+    assert all(field.description for field in effect.Params.model_fields.values())
 
 
-def test_a_taken_name_is_refused(installed):
+def test_a_class_and_its_variants_are_registered_once(installed):
     assert register(Hail) is Hail and register(Hail) is Hail
-    other = type("OtherHail", (Hail,), {})
-    with pytest.raises(BadInput, match="hail.*another name"):
-        register(other)
     variant = register(type("LargeHail", (Hail,), {"variant": "large"}))
     assert catalogue()[-2:] == (Hail, variant)
-    with pytest.raises(BadInput, match="gain_offsets"):
-        register(type("Offset", (Hail,), {"name": "device_gain_offset"}))
 
 
-def test_what_is_no_effect_is_refused(installed):
-    for thing in (dict, Hail()):
-        with pytest.raises(BadInput, match="subclass"):
-            register(thing)
+@pytest.mark.parametrize(("thing", "why"), [
+    (type("OtherHail", (Hail,), {}), "hail.*another name"), (dict, "subclass"), (Hail(), "subclass"),
+    (type("Offset", (Hail,), {"name": "device_gain_offset"}), "gain_offsets")])
+def test_what_is_no_effect_or_has_a_taken_name_is_refused(installed, thing, why):
+    register(Hail)
+    with pytest.raises(BadInput, match=why):
+        register(thing)
 
 
 def test_an_unknown_name_says_what_is_known(installed):
@@ -90,6 +93,22 @@ def test_the_effect_of_the_guide_works(installed, make_links):
     assert variation.effect(np.array([6.0])).neg_log_prior() == pytest.approx(0.5)
 
 
-@pytest.mark.parametrize("effect", registry.BUILT_IN, ids=lambda effect: effect.__name__)
-def test_every_parameter_has_a_description(effect):
-    assert all(field.description for field in effect.Params.model_fields.values())
+@pytest.mark.parametrize(("name", "why", "given"), [
+    ("uncertain_sight", "no 3D map", {}),
+    ("uncertain_sight", "decide over 0 links", FAR_HOUSE),
+    ("roof_heights", "no 3D map", {}),
+    ("building_entry", "no 3D map", {}),
+    ("building_entry", "frequency", FAR_HOUSE | {"frequency_hz": np.nan}),
+    ("building_entry", "0 links", FAR_HOUSE),
+    ("mapped_vegetation", "the map shows no vegetation", FAR_HOUSE),
+    ("ground_reflection", "frequency_hz", {"frequency_hz": np.nan}),
+    ("missing_obstacle", "frequency_hz", {"frequency_hz": np.nan}),
+    ("receiver_gain_offset", "two receivers", {}),
+    ("receiver_drift", "time_s", {}),
+    ("receiver_clock_offset", "time_s", {}),
+    ("receiver_clock_offset", "moves", {"time_s": np.arange(100.0)})])
+def test_what_the_links_cannot_show_is_not_looked_for(make_links, name, why, given):
+    receiver_m = np.ones((100, 3)) if why == "moves" else NEAR_M
+    links = make_links([[0.0, 0.0, 2.0]], receiver_m, **given)
+    (effect,) = (each for each in registry.BUILT_IN if each.name == name)
+    assert why in effect().unavailable(links)

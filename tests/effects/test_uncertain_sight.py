@@ -68,11 +68,3 @@ def test_where_the_map_is_right_it_changes_next_to_nothing(world):
     before, after = fit.readings(), better.readings()
     assert np.abs(after.mean_db - before.mean_db).max() < 3.0
     assert np.median(np.abs(after.scale_db / before.scale_db - 1)) < 0.05
-
-
-def test_it_needs_a_map_and_links_beside_walls(world, make_links):
-    assert UncertainSight().unavailable(world(0)) is None
-    alone = make_links(np.array([[0.0, 0.0, 2.0]]), np.random.default_rng(0).uniform(20, 90, (100, 3)))
-    assert "no 3D map" in UncertainSight().unavailable(alone)
-    away = make_links(np.array([[200.0, 200.0, 50.0]]), np.random.default_rng(0).uniform(150, 250, (100, 3)), city=city())
-    assert "decide over 0 links" in UncertainSight().unavailable(away)

@@ -91,11 +91,11 @@ def test_ends_that_never_part_are_said_to_be_one():
     for effect, end, rival in ((ReceiverDrift, "receivers", ["device_drift"]), (DeviceDrift, "devices", ["receiver_drift"])):
         found = {member: effect().with_params(effect.Params.model_validate({end: {member: Drift("ageing", 0.0)}}))
                  for member in (0, 2)}
-        assert found[2].same_as(links, {}) == rival and found[0].same_as(links, {}) == []
+        assert found[2].rivals(links, {}) == rival and found[0].rivals(links, {}) == []
     offsets = ReceiverGainOffset().with_params(ReceiverGainOffset.Params(members=[0, 1, 2], offsets_sd_db=2.0))
     for sizes_db, rivals in (((0.1, 0.3, -5.0), ["device_gain_offset"]), ((0.1, 5.0, 0.2), [])):
         values = {f"offset_db[r{each}]": Parameter(size, None, None, "dB") for each, size in enumerate(sizes_db)}
-        assert offsets.same_as(links, values) == rivals
+        assert offsets.rivals(links, values) == rivals
 
 
 @pytest.mark.parametrize("timed", [True, False])

@@ -4,22 +4,17 @@
     case("missing_obstacle", 0).scene           # what a user would declare
     case("missing_obstacle", 0).answer          # what neither of them says
 
-    python -m tests.undeclared.cases missing_obstacle 0 FOLDER   # writes measurements and scene, to try them
-
 A case reads its tables and draws the rest from its seed, in a fraction of a second and without a ray tracer.
 """
 
-import shutil
-import sys
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from radiotwin.links.measurements import Measurements
 from radiotwin.scene import Scene
-from tests.undeclared import clocks, tables
+from tests.undeclared import faults, tables
 from tests.undeclared.cities import declared_scene
 from tests.undeclared.families import (
     FAMILIES,
@@ -81,7 +76,7 @@ def case(family: str, seed: int) -> Case:
     read_db = _read(clean_db, arriving_db, declared_scene(where.city).config.gain_limit_db,
                     rng_of(family, seed, "noise"))
     unknown = {where.names[row]: where.device_m[row].tolist() for row in np.flatnonzero(~where.is_anchor)}
-    written_m = next((clocks.written_m(effect, where) for effect in untraced_effects
+    written_m = next((faults.written_m(effect, where) for effect in untraced_effects
                       if effect["name"] == "receiver_clock_offset"), where.points_m)
     measurements = Measurements(_links(where, written_m, read_db), _devices(where))
     return Case(family, seed, measurements, declared_scene(where.city),
@@ -126,14 +121,3 @@ def _devices(where: World) -> pd.DataFrame:
     plane_m = np.where(where.is_anchor[:, None], where.device_m[:, :2], np.nan)
     return pd.DataFrame({"device": where.names, "x_m": plane_m[:, 0], "y_m": plane_m[:, 1],
                          "z_m": where.device_m[:, 2], "role": np.where(where.is_anchor, "anchor", "unknown")})
-
-
-def write(family: str, seed: int, folder: Path) -> None:
-    """Write what a user would have of a case: `measurements.csv`, `devices.csv` and the folder `scene`."""
-    one = case(family, seed)
-    one.measurements.save(folder / "measurements.csv")
-    shutil.copytree(one.scene.folder, folder / "scene", dirs_exist_ok=True)
-
-
-if __name__ == "__main__":
-    write(sys.argv[1], int(sys.argv[2]), Path(sys.argv[3]))

@@ -7,20 +7,17 @@ rows of houses and courtyards. Neither is drawn as the cities in `scenes/` are.
 import atexit
 import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-import trimesh
 
 from radiotwin.io.files import atomic_path
 from radiotwin.scene import Scene
 from radiotwin.scene.config import Extent, LatticeConfig, RadioConfig, SceneConfig, write_config
-from radiotwin.scene.folder import CityShape, write_city
 from radiotwin.scene.materials import Material, permittivity
-from tests.undeclared.shapes import corners_of, fits, prism, turned
+from tests.undeclared.shapes import Building, corners_of, fits, turned, write_prisms
 
 SCENES = Path(__file__).parent / "scenes.zip"
 SIDE_M = 500.0
@@ -30,15 +27,6 @@ RADIO = {"oldtown": RadioConfig(frequency_hz=1.8e9, sensitivity_dbm=-112.0),
          "grid": RadioConfig(frequency_hz=3.5e9, sensitivity_dbm=-118.0)}
 ROOM_M = 6.0  # between two buildings, so that moved walls never touch
 GROUND = "asphalt_concrete"
-
-
-@dataclass(frozen=True, eq=False)
-class Building:
-    """A prism: footprint (k, 2) counter-clockwise [m], the inner corner of an L first; height [m]; ITU material."""
-
-    footprint_m: np.ndarray
-    height_m: float
-    material: str
 
 
 @cache
@@ -110,8 +98,8 @@ def write_declared() -> None:
 
 def _write_scene(folder: Path, city: str) -> None:
     folder.mkdir()
-    _write(folder, list(buildings(city)), {b.material: Material(b.material, itu=b.material) for b in buildings(city)},
-           Material(GROUND, itu=GROUND))
+    write_prisms(folder, SIDE_M, MARGIN_M, [(b, Material(b.material, itu=b.material)) for b in buildings(city)],
+                 Material(GROUND, itu=GROUND))
     write_config(SceneConfig(
         name=city, radio=RADIO[city], extent=Extent(x_min_m=0, x_max_m=SIDE_M, y_min_m=0, y_max_m=SIDE_M),
         lattice=LatticeConfig(step_m=20, altitudes_m=[50, 65, 80]), provenance={"generator": "tests/undeclared"},
@@ -119,17 +107,9 @@ def _write_scene(folder: Path, city: str) -> None:
 
 
 def write_truth(folder: Path, city: str, seed: int, *, without: int | None = None, more: Sequence[Building] = ()) -> Path:
-    """Write the city as it is, which no survey knows: walls elsewhere, other materials, some roughness.
+    """Write the city as it is, which no survey (`seed`) knows: walls elsewhere, other materials, some roughness.
 
-    Args:
-        folder: existing.
-        city: a key of `CITIES`.
-        seed: of the survey's errors.
-        without: index of a building that was pulled down.
-        more: buildings that no map shows.
-
-    Returns:
-        Path of `city.xml`.
+    The building `without` was pulled down; `more` are on no map. Returns the path of `city.xml`.
     """
     rng = np.random.default_rng([seed, 7])
     real = []
@@ -140,7 +120,7 @@ def write_truth(folder: Path, city: str, seed: int, *, without: int | None = Non
             real.append(Building(building.footprint_m + shift, building.height_m + taller, building.material))
     names = sorted({b.material for b in buildings(city)} | {b.material for b in more} | {GROUND})
     materials = {name: _real_material(name, RADIO[city].frequency_hz, rng) for name in names}
-    _write(folder, [*real, *more], materials, materials[GROUND])
+    write_prisms(folder, SIDE_M, MARGIN_M, [(b, materials[b.material]) for b in (*real, *more)], materials[GROUND])
     return folder / "city.xml"
 
 
@@ -149,13 +129,3 @@ def _real_material(name: str, frequency_hz: float, rng: np.random.Generator) -> 
     relative, conductivity = np.array([relative, conductivity]) * rng.uniform(0.85, 1.15, 2)
     return Material(f"{name}-real", relative_permittivity=float(relative), conductivity_s_per_m=float(conductivity),
                     thickness_m=0.3, scattering_coefficient=0.1 if name == GROUND else 0.25, xpd_coefficient=0.1)
-
-
-def _write(folder: Path, solids: list[Building], materials: dict[str, Material], ground: Material) -> None:
-    low, high = -MARGIN_M, SIDE_M + MARGIN_M
-    plane = trimesh.Trimesh([[low, low, 0], [high, low, 0], [high, high, 0], [low, high, 0]],
-                            [[0, 1, 2], [0, 2, 3]], process=False)
-    shapes = [CityShape("ground", plane, ground)]
-    shapes += [CityShape(f"b{number:03d}", prism(solid.footprint_m, solid.height_m), materials[solid.material])
-               for number, solid in enumerate(solids)]
-    write_city(folder, shapes)

@@ -4,7 +4,7 @@ import zlib
 
 import numpy as np
 
-from tests.undeclared import clocks, faults, hidden, losses, outside
+from tests.undeclared import faults, hidden, losses, outside
 from tests.undeclared.worlds import World, world
 
 SEEDS = range(5)
@@ -67,12 +67,7 @@ def traced_effects(family: str, seed: int) -> list[dict]:
 def untraced(family: str, seed: int, clean_db: np.ndarray) -> tuple[list[dict], np.ndarray, np.ndarray]:
     """Draw and apply the effects that need no trace, those in the air before those in the receivers.
 
-    Args:
-        family, seed: of the case.
-        clean_db: (k, p) traced gain [dB], NaN where there is no path.
-
-    Returns:
-        Entries of the answer, (k, p) what arrives at the receivers, and (k, p) what they would read without noise [dB].
+    Returns entries of the answer, what arrives at the receivers, and what they would read without noise (k, p) [dB].
     """
     where, found, arriving_db = world_of(family, seed), [], clean_db
     for name in sorted(names(family, seed), key=lambda name: name.startswith("receiver")):
@@ -84,7 +79,7 @@ def untraced(family: str, seed: int, clean_db: np.ndarray) -> tuple[list[dict], 
             found.append(losses.excess_attenuation(where, rng))
             clean_db = clean_db - losses.haze_loss_db(found[-1], where.device_m, where.points_m)
         elif name == "receiver_clock_offset":  # of places; levels stay
-            found.append(clocks.receiver_clock_offset(where, rng))
+            found.append(faults.receiver_clock_offset(where, rng))
         elif name in OUTSIDE:
             found.append(getattr(outside, name)(where, rng, clean_db))
             clean_db = outside.reading_db(found[-1], where, clean_db)

@@ -50,17 +50,31 @@ def receiver_saturation(world: World, rng: np.random.Generator, clean_db: np.nda
             "knee": round(float(rng.uniform(0.8, 2.0)), 2)}
 
 
+def receiver_clock_offset(world: World, rng: np.random.Generator) -> dict:
+    """The places beside one receiver's levels are those of one to four seconds before, or after."""
+    late_s = rng.choice([-1, 1]) * rng.uniform(1, 4)
+    return {"name": "receiver_clock_offset", "receiver": _one(rng), "late_s": round(float(late_s), 2)}
+
+
+def written_m(effect: dict, world: World) -> np.ndarray:
+    """(p, 3) the places that are written down [m]; a UAV goes straight on before the first slot and after the last."""
+    points_m, late = world.points_m.copy(), effect["late_s"]  # a slot takes a second
+    whole = int(np.floor(-late))
+    share = -late - whole
+    for first in range(0, len(points_m), SLOTS):
+        if f"uav{world.receiver[first]}" != effect["receiver"]:
+            continue
+        track = world.points_m[first:first + SLOTS]
+        far = np.arange(1, 10)[:, None]
+        longer = np.vstack([track[0] - far[::-1] * (track[1] - track[0]), track,
+                            track[-1] + far * (track[-1] - track[-2])])
+        there = np.arange(SLOTS) + 9 + whole
+        points_m[first:first + SLOTS] = (1 - share) * longer[there] + share * longer[there + 1]
+    return points_m.round(2)
+
+
 def reading_db(effect: dict, world: World, level_db: np.ndarray) -> np.ndarray:
-    """What the receivers read in place of the level that arrives without the fault.
-
-    Args:
-        effect: of this module, as an entry of the answer.
-        world: names the links' ends and times.
-        level_db: (k, p) [dB]
-
-    Returns:
-        (k, p) [dB]
-    """
+    """What the receivers read (k, p) in place of the level that arrives without the fault (an entry of the answer) [dB]."""
     if "device" in effect:
         faulty = (np.array(world.names) == effect["device"])[:, None]
     else:

@@ -5,9 +5,8 @@ Each function draws one effect and returns it as an entry of the answer, plain e
 
 import numpy as np
 
-from radiotwin.scene.citymap import CityMap
 from tests.undeclared.cities import buildings, declared_scene
-from tests.undeclared.shapes import distance_m, prism
+from tests.undeclared.shapes import blocked_alone, distance_m
 from tests.undeclared.worlds import UAVS, World, free
 
 TRACED = ("missing_obstacle", "removed_obstacle", "device_position_error", "antenna_pattern")
@@ -27,9 +26,7 @@ def removed_obstacle(world: World, rng: np.random.Generator) -> dict:
     b_m = np.tile(points_m, (len(world.device_m), 1))
     blocked = np.flatnonzero(~declared_scene(world.city).city.line_of_sight(a_m, b_m))
     a_m, b_m = a_m[blocked], b_m[blocked]
-    solids = [prism(b.footprint_m, b.height_m) for b in buildings(world.city)]
-    blocks = np.array([~CityMap(solid.vertices, solid.faces).line_of_sight(a_m, b_m) for solid in solids])
-    alone = (blocks & (blocks.sum(axis=0) == 1)).sum(axis=1)
+    alone = blocked_alone(buildings(world.city), a_m, b_m)
     index = int(rng.choice(np.argsort(-alone, kind="stable")[:8]))
     building = buildings(world.city)[index]
     return {"name": "removed_obstacle", "building": index, "shape": f"b{index:03d}",
@@ -53,12 +50,7 @@ def device_position_error(world: World, rng: np.random.Generator) -> dict:
 
 
 def sector_antenna(world: World, rng: np.random.Generator, but: str | None = None) -> dict:
-    """A sector antenna (3GPP TR 38.901) on an anchor.
-
-    Args:
-        world, rng: see there.
-        but: name of an anchor to leave alone.
-    """
+    """A sector antenna (3GPP TR 38.901) on an anchor, other than that named `but`."""
     choice = [number for number in np.flatnonzero(world.is_anchor) if world.names[number] != but]
     return {"name": "antenna_pattern", "kind": "sector", "device": world.names[int(rng.choice(choice))],
             "pattern": "tr38901", "azimuth_deg": round(float(rng.uniform(0, 360)), 1),
@@ -73,16 +65,9 @@ def tilted_dipole(world: World, rng: np.random.Generator) -> dict:
 
 
 def dipole_turns_rad(world: World, points: np.ndarray, tilt_deg: float, tilt_towards_deg: float) -> np.ndarray:
-    """Angles of the dipole's frame about z, y, x, following the UAV's heading, pitch and roll.
+    """(n, 3) angles of the dipole's frame about z, y, x at some points, following the UAV's heading, pitch and roll [rad].
 
-    Args:
-        world: of the flights.
-        points: (n,) rows of the world's points.
-        tilt_deg: of the dipole from the body's upward axis.
-        tilt_towards_deg: side of the body it leans to, clockwise seen from above: 0 the nose, 90 the right side.
-
-    Returns:
-        (n, 3) [rad]
+    It leans by `tilt_deg` from the body's upward axis to a side, clockwise from above: 0 the nose, 90 the right side.
     """
     yaw = np.radians(90 - world.heading_deg[points])
     # Turned about the left side, the nose goes down; about the nose, the right side goes down.

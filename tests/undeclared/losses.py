@@ -53,16 +53,7 @@ def _trees(city: str, centre: np.ndarray, widths: np.ndarray, height_m: float, l
 
 
 def foliage_loss_db(effect: dict, device_m: np.ndarray, points_m: np.ndarray) -> np.ndarray:
-    """Loss of links that saturates with the metres of crown on them.
-
-    Args:
-        effect: as `foliage` gives it.
-        device_m: (k, 3) [m].
-        points_m: (p, 3) [m].
-
-    Returns:
-        (k, p) [dB], at least 0.
-    """
+    """(k, p) loss of links that saturates with the metres of crown on them [dB]."""
     trees = np.concatenate([grove["trees"] for grove in effect["groves"]])
     middle = np.column_stack([trees[:, :2], (trees[:, 3] + STEM_M) / 2])
     half = np.column_stack([trees[:, 2], trees[:, 2], (trees[:, 3] - STEM_M) / 2])
@@ -87,16 +78,7 @@ def excess_attenuation(world: World, rng: np.random.Generator) -> dict:
 
 
 def haze_loss_db(effect: dict, device_m: np.ndarray, points_m: np.ndarray) -> np.ndarray:
-    """Loss of links through haze of exponentially falling density.
-
-    Args:
-        effect: as `excess_attenuation` gives it.
-        device_m: (k, 3) [m].
-        points_m: (p, 3) [m].
-
-    Returns:
-        (k, p) [dB]
-    """
+    """(k, p) loss of links through haze of exponentially falling density [dB]."""
     scale_m = effect["scale_height_m"]
     low, high = device_m[:, None, 2], points_m[None, :, 2]
     length_km = np.linalg.norm(points_m[None] - device_m[:, None], axis=-1) / 1000

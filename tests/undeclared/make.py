@@ -28,16 +28,7 @@ def trace_world(where: World) -> np.ndarray:
 
 
 def trace_case(where: World, effects: list[dict], gain_db: np.ndarray) -> np.ndarray:
-    """Gain with effects hidden; only the links are traced that they can change.
-
-    Args:
-        where: the world.
-        effects: as `traced_effects` gives them.
-        gain_db: (k, p) gain of the world with nothing hidden [dB].
-
-    Returns:
-        (k, p) [dB]
-    """
+    """(k, p) gain with effects hidden [dB]; only the links are traced that they can change."""
     device_m, antennas = where.device_m.copy(), {}
     changed = np.zeros(gain_db.shape, dtype=bool)
     receiver_antenna, points = Antenna(), np.arange(len(where.points_m))

@@ -1,20 +1,28 @@
-"""Footprints and prisms: the little plane geometry that the cities need."""
+"""Buildings as prisms: the little geometry that the cities need."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import trimesh
 
+from radiotwin.scene.citymap import CityMap
+from radiotwin.scene.folder import CityShape, write_city
+from radiotwin.scene.materials import Material
+
+
+@dataclass(frozen=True, eq=False)
+class Building:
+    """A prism: footprint (k, 2) counter-clockwise [m], the inner corner of an L first; height [m]; ITU material."""
+
+    footprint_m: np.ndarray
+    height_m: float
+    material: str
+
 
 def corners_of(kind: str, length_m: float, width_m: float, rng: np.random.Generator) -> np.ndarray:
-    """Corners of a footprint around the origin, counter-clockwise.
-
-    Args:
-        kind: `box`, `ell` (the inner corner comes first) or `pentagon`.
-        length_m, width_m: sides of the rectangle around it [m].
-        rng: for the cuts.
-
-    Returns:
-        (k, 2) [m]
-    """
+    """(k, 2) corners of a box, an ell (the inner corner first) or a pentagon around the origin, counter-clockwise [m]."""
     a, b = length_m / 2, width_m / 2
     if kind == "box":
         return np.array([(-a, -b), (a, -b), (a, b), (-a, b)])
@@ -80,3 +88,28 @@ def prism(corners_m: np.ndarray, height_m: float) -> trimesh.Trimesh:
     walls = [face for i, j in enumerate(nxt) for face in ((i, j, k + j), (i, k + j, k + i))]
     roof = [(k, k + i, k + i + 1) for i in range(1, k - 1)]
     return trimesh.Trimesh(vertices, np.array(walls + roof), process=False)
+
+
+def write_prisms(folder: Path, side_m: float, margin_m: float, solids: Sequence[tuple[Building, Material]],
+                 ground: Material) -> None:
+    """Write a scene's `city.xml` and meshes: a square of ground with a margin around it, and buildings of materials."""
+    low, high = -margin_m, side_m + margin_m
+    plane = trimesh.Trimesh([[low, low, 0], [high, low, 0], [high, high, 0], [low, high, 0]],
+                            [[0, 1, 2], [0, 2, 3]], process=False)
+    write_city(folder, [CityShape("ground", plane, ground), *(
+        CityShape(f"b{number:03d}", prism(one.footprint_m, one.height_m), material)
+        for number, (one, material) in enumerate(solids))])
+
+
+def blocked(buildings: Sequence[Building], a_m: np.ndarray, b_m: np.ndarray) -> np.ndarray:
+    """(n,) whether a building stands between points (n, 3)."""
+    solids = [prism(one.footprint_m, one.height_m) for one in buildings]
+    offsets = np.cumsum([0] + [len(one.vertices) for one in solids])
+    faces = np.concatenate([one.faces + offset for one, offset in zip(solids, offsets)])
+    return ~CityMap(np.concatenate([one.vertices for one in solids]), faces).line_of_sight(a_m, b_m)
+
+
+def blocked_alone(buildings: Sequence[Building], a_m: np.ndarray, b_m: np.ndarray) -> np.ndarray:
+    """(buildings,) number of lines (n, 3) that each building alone blocks."""
+    blocks = np.array([blocked([one], a_m, b_m) for one in buildings])
+    return (blocks & (blocks.sum(axis=0) == 1)).sum(axis=1)

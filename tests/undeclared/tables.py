@@ -34,14 +34,7 @@ def keys() -> frozenset[str]:
 
 
 def save(key: str, world: World, gain_db: np.ndarray, effects: list[dict]) -> None:
-    """Add a table to the archive, or replace it; the archive is rewritten as a whole or not at all.
-
-    Args:
-        key: see `world_key` and `case_key`.
-        world: of the table.
-        gain_db: `(k, p)`, NaN where there is no path.
-        effects: that the trace contains.
-    """
+    """Add a table (k, p) to the archive, or replace it; the archive is rewritten as a whole or not at all."""
     steps = np.where(np.isnan(gain_db), NO_PATH, np.round(np.nan_to_num(gain_db) / STEP_DB)).astype(np.int16)
     content = {}
     if PATH.is_file():
@@ -57,14 +50,9 @@ def save(key: str, world: World, gain_db: np.ndarray, effects: list[dict]) -> No
 
 
 def load(key: str, world: World) -> tuple[np.ndarray, list[dict]]:
-    """Read a table.
+    """Read a table: (k, p) gain [dB], NaN where there is no path, and the effects in it.
 
-    Returns:
-        `(k, p)` gain [dB], NaN where there is no path, and the effects in it.
-
-    Raises:
-        KeyError: no such table.
-        ValueError: the table was traced for other positions than the world has now.
+    ValueError: the table was traced for other positions than the world has now.
     """
     with np.load(PATH, allow_pickle=False) as archive:
         if not np.allclose(archive[f"{key}/positions_m"], _positions_m(world), atol=0.02):

@@ -37,12 +37,7 @@ class Antenna:
 
 
 class TrueCity:
-    """A city that can be solved for one device at a time.
-
-    Args:
-        xml_path: of the true city.
-        frequency_hz: of its radio.
-    """
+    """A true city that can be solved for one device at a time."""
 
     def __init__(self, xml_path: Path, frequency_hz: float):
         self._city = load_city(xml_path, frequency_hz)
@@ -56,16 +51,7 @@ class TrueCity:
 
     def gains(self, device_m: np.ndarray, points_m: np.ndarray, at_device: Antenna = Antenna(),
               at_receiver: Antenna = Antenna()) -> np.ndarray:
-        """Gains of the links from a device to points.
-
-        Args:
-            device_m: (3,) [m].
-            points_m: (n, 3) [m].
-            at_device, at_receiver: antennas; the turn of the latter may be (n, 3).
-
-        Returns:
-            (n,) gain [dB], NaN where there is no path.
-        """
+        """(n,) gains of the links from a device to points (n, 3) [dB], NaN where there is no path."""
         self._city.tx_array = self._array(at_device.pattern)
         self._city.rx_array = self._array(at_receiver.pattern)
         self._transmitter.position = [float(value) for value in device_m]

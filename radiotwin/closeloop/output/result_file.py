@@ -92,7 +92,7 @@ def make_report(loop: Loop) -> dict[str, Any]:
                 "size_db": size.record(), "places": _places(each, parameters, loop.after.links),
                 "confused_with": list(each.confused_with),
                 "indistinguishable_from": sorted({*trial.rivals,
-                                                  *each.same_as(loop.after.links, parameters)}),
+                                                  *each.rivals(loop.after.links, parameters)}),
                 "probability": trial.probability, "anomalies": explained,
                 "evidence": {"heldout_nll_gain": trial.nll_gain,
                              "evidence_nats": trial.evidence_nats}}

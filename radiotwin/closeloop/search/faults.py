@@ -244,7 +244,7 @@ def with_fault(model: CrossFit, candidate: Candidate) -> CrossFit:
     found = candidate.whole.effects[-1]
 
     def extend(fold: Fit) -> Fit:
-        params = found.propose_like(fold.view)
+        params = found.propose_for_fold(fold.view)
         return fold.with_effects([*fold.effects, found.with_params(params[0])]) if params else fold
 
     return model.with_fits(candidate.whole, [extend(fold) for fold in model.folds])

@@ -8,21 +8,14 @@ With a 3D map each path has the loss of its direction of arrival; a link without
 of the straight line.
 """
 
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from radiotwin.effects.antennas import (
-    MIN_LINKS,
-    MIN_NATS,
-    BodyFrameEffect,
-    linear,
-    report_patterns,
-)
-from radiotwin.effects.arrays import frequent_labels, subsample
+from radiotwin.effects.antennas import MIN_NATS, BodyFrameEffect, linear, report_patterns
+from radiotwin.effects.arrays import subsample
 from radiotwin.effects.base import ResidualView
 from radiotwin.effects.params import (
     EffectParams,
@@ -59,6 +52,26 @@ class Body(EffectParams):
         return self.depth_db * _relative_loss(arrival @ middle, self.width_deg)
 
 
+class _Arrivals(NamedTuple):
+    """Rays of n links' paths at their receivers, and unit vectors along right, nose, top."""
+
+    rays: Rays
+    direction: np.ndarray  # (p, 3) towards where each ray comes from
+    straight: np.ndarray  # (n, 3) along the straight line to the device
+
+    @classmethod
+    def of(cls, links: Links, rows: np.ndarray) -> "_Arrivals":
+        """Find the arrivals of some links, with paths over the map."""
+        links = links.select(rows)
+        rays = Rays.of(links, of_device=False)
+        return cls(rays, _in_body(links, rays), _straight(links))
+
+    def gain_db(self, body: Body) -> np.ndarray:
+        """Compute the gain (n,), at most 0, of each link by a body [dB]."""
+        along_db = self.rays.through_antenna_db(linear(-body.loss_db(self.direction)))
+        return np.where(np.isnan(along_db), -body.loss_db(self.straight), along_db)
+
+
 class BodyShadowing(BodyFrameEffect):
     """Receivers whose body attenuates arrivals from one side."""
 
@@ -71,6 +84,7 @@ class BodyShadowing(BodyFrameEffect):
                         "body_elevation_deg": "body, up from the deck",
                         "body_width_deg": "body, across, to half its loss"}
     confused_with = ("antenna_pattern",)
+    arrivals = _Arrivals.of
 
     class Params(EffectParams):
         """Bodies that shadow."""
@@ -81,30 +95,38 @@ class BodyShadowing(BodyFrameEffect):
     params: Params
 
     @override
-    def propose(self, view: ResidualView) -> list[Params]:
-        """Propose the body shadow that fits each receiver's residuals, where one fits clearly."""
-        links, found = view.links, {}
-        usable = np.isfinite(links.heading_deg) & np.isfinite(links.level_db)
-        for receiver in frequent_labels(links.receiver[usable], MIN_LINKS):
-            body = _best_body(view, np.flatnonzero((links.receiver == receiver) & usable))
-            if body is not None:
-                found[receiver] = body
-        return [self.Params(receivers=found)] if found else []
+    def usable(self, links: Links) -> np.ndarray:
+        return np.isfinite(links.heading_deg) & np.isfinite(links.level_db)
 
     @override
-    def propose_like(self, view: ResidualView) -> list[Params]:
+    def best_pattern(self, view: ResidualView, rows: np.ndarray) -> Body | None:
+        """Find the best shadow of a grid; its level and depth (ridge regression) are fitted."""
+        few = subsample(rows, MAX_LINKS)
+        weight = view.weight[few] * (len(rows) / len(few))
+        residual_db, total = view.residual_db[few], weight.sum()
+        residual_db = residual_db - weight @ residual_db / total
+        azimuth_deg, elevation_deg = (each.ravel() for each in np.meshgrid(
+            np.arange(0.0, 360.0, SEARCH_STEP_DEG),
+            np.arange(-90.0 + SEARCH_STEP_DEG, 90.0, SEARCH_STEP_DEG)))
+        cosine = _straight(view.links.select(few)) @ _directions(azimuth_deg, elevation_deg).T
+        best, most_nats = None, MIN_NATS
+        for width_deg in SEARCHED_WIDTHS_DEG:
+            share = _relative_loss(cosine, width_deg)
+            share -= weight @ share / total
+            moment = np.maximum(-(weight * residual_db) @ share, 0.0)
+            precision = weight @ share**2 + DEPTH_SD_DB**-2
+            nats = 0.5 * moment**2 / precision
+            number = int(nats.argmax())
+            if nats[number] > most_nats:
+                most_nats = float(nats[number])
+                best = Body(depth_db=min(float(moment[number] / precision[number]), 40.0),
+                            azimuth_deg=float(azimuth_deg[number]),
+                            elevation_deg=float(elevation_deg[number]), width_deg=width_deg)
+        return best
+    @override
+    def propose_for_fold(self, view: ResidualView) -> list[Params]:
         """Propose anew from the fold's residuals, and also the parameters found on all links."""
         return [*self.propose(view), self.params]
-
-    @override
-    def gain_db(self, links: Links) -> np.ndarray:
-        """Compute the loss (n,) by the receivers' bodies, as negative gain [dB]."""
-        gain_db = np.zeros(len(links))
-        for receiver, body in self.params.receivers.items():
-            rows = np.flatnonzero((links.receiver == receiver) & np.isfinite(links.heading_deg))
-            arrivals = self.of_links.get(links, receiver, partial(_Arrivals.of, links, rows))
-            gain_db[rows] = arrivals.gain_db(body)
-        return gain_db
 
     @override
     def typical_patterns(self, view: ResidualView) -> list[Pattern]:
@@ -120,32 +142,6 @@ class BodyShadowing(BodyFrameEffect):
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
         return report_patterns(self.params.receivers, estimate.params_sd, links.receiver_names,
                                prefix="body_")
-
-
-class _Arrivals(NamedTuple):
-    """Directions of arrival of n links in the body frame: unit vectors along right, nose, top.
-
-    Attributes:
-        rays: p rays of the paths at the receiver.
-        direction: (p, 3) towards where each ray comes from.
-        straight: (n, 3) along the straight line to the device.
-    """
-
-    rays: Rays
-    direction: np.ndarray
-    straight: np.ndarray
-
-    @classmethod
-    def of(cls, links: Links, rows: np.ndarray) -> "_Arrivals":
-        """Find the arrivals of some links, with paths over the map."""
-        links = links.select(rows)
-        rays = Rays.of(links, of_device=False)
-        return cls(rays, _in_body(links, rays), _straight(links))
-
-    def gain_db(self, body: Body) -> np.ndarray:
-        """Compute the gain (n,), at most 0, of each link by a body [dB]."""
-        along_db = self.rays.through_antenna_db(linear(-body.loss_db(self.direction)))
-        return np.where(np.isnan(along_db), -body.loss_db(self.straight), along_db)
 
 
 def _straight(links: Links) -> np.ndarray:
@@ -170,33 +166,3 @@ def _relative_loss(cosine: np.ndarray, width_deg: float) -> np.ndarray:
     """Compute loss over depth from the cosine of the angle to the body's middle."""
     exponent = np.log(0.5) / (2 * np.log(np.cos(np.radians(width_deg / 4))))
     return np.clip((1 + cosine) / 2, 0.0, 1.0) ** exponent
-
-
-def _best_body(view: ResidualView, rows: np.ndarray) -> Body | None:
-    """Find the shadow of a receiver's body that fits its residuals best, on a grid of shadows.
-
-    Its level and, by ridge regression, depth are fitted for each trial direction and width. None
-    if the log-likelihood gain is at most `MIN_NATS`.
-    """
-    few = subsample(rows, MAX_LINKS)
-    weight = view.weight[few] * (len(rows) / len(few))
-    residual_db, total = view.residual_db[few], weight.sum()
-    residual_db = residual_db - weight @ residual_db / total
-    azimuth_deg, elevation_deg = (each.ravel() for each in np.meshgrid(
-        np.arange(0.0, 360.0, SEARCH_STEP_DEG),
-        np.arange(-90.0 + SEARCH_STEP_DEG, 90.0, SEARCH_STEP_DEG)))
-    cosine = _straight(view.links.select(few)) @ _directions(azimuth_deg, elevation_deg).T
-    best, most_nats = None, MIN_NATS
-    for width_deg in SEARCHED_WIDTHS_DEG:
-        share = _relative_loss(cosine, width_deg)
-        share -= weight @ share / total
-        moment = np.maximum(-(weight * residual_db) @ share, 0.0)
-        precision = weight @ share**2 + DEPTH_SD_DB**-2
-        nats = 0.5 * moment**2 / precision
-        number = int(nats.argmax())
-        if nats[number] > most_nats:
-            most_nats = float(nats[number])
-            best = Body(depth_db=min(float(moment[number] / precision[number]), 40.0),
-                        azimuth_deg=float(azimuth_deg[number]),
-                        elevation_deg=float(elevation_deg[number]), width_deg=width_deg)
-    return best

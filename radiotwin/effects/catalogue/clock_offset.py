@@ -13,7 +13,6 @@ from radiotwin.effects.arrays import frequent_labels
 from radiotwin.effects.base import ResidualView
 from radiotwin.effects.moves import MAX_ENDS, MIN_LINKS, MovedEnd
 from radiotwin.effects.params import (
-    Allowed,
     EffectParams,
     Estimate,
     Parameter,
@@ -89,9 +88,7 @@ class ReceiverClockOffset(MovedEnd):
     @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
         name = f"positions_late_by_s[{links.receiver_names[self.params.receiver]}]"
-        max_s = MAX_M / self.params.speed_m_s
-        return {name: Parameter.normal(self.params.offset_s, estimate.params_sd[0], "s",
-                                       Allowed(-max_s, max_s))}
+        return self.variation().parameters({name: "s"}, estimate.params_sd)
 
 
 def _speeds_m_s(links: Links) -> dict[int, float]:

@@ -128,7 +128,7 @@ class Episode(GainEffect):
         return [params for _, params in sorted(found, key=lambda pair: -pair[0])[:2]]
 
     @override
-    def propose_like(self, view: ResidualView) -> list[Params]:
+    def propose_for_fold(self, view: ResidualView) -> list[Params]:
         """Propose the same episode for a fold, its times estimated anew, without held-out links."""
         value_db, weight = by_precision(view, compared_where_possible_db(view)[0])
         rows = _timed_rows(view.links, self.params.receiver, self.params.flight)

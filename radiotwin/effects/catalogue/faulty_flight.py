@@ -63,21 +63,15 @@ RELATION_SD = 0.5  # prior sd of the change of slope
 
 @dataclass(frozen=True)
 class _Flight:
-    """Statistics of one receiver's flight; NaN: unknown.
-
-    Attributes:
-        receiver, flight: indices.
-        rows: its detected links.
-        levels_db: level of the compared residuals (see `compared_db`) and of the residuals, minus
-            the median over the receiver's flights [dB]; NaN if its devices disagree.
-        log_scatters: log scatter of the compared residuals, and log roughness [log dB].
-    """
+    """Statistics of one receiver's flight; NaN: unknown."""
 
     receiver: int
     flight: int
-    rows: np.ndarray
+    rows: np.ndarray  # its detected links
+    # Of compared residuals (see `compared_db`) and of residuals, minus the median over the
+    # receiver's flights; NaN if its devices disagree.
     levels_db: tuple[float, float]
-    log_scatters: tuple[float, float]
+    log_scatters: tuple[float, float]  # of the compared residuals, and roughness [log dB]
 
 
 class FaultyFlight(GainEffect):
@@ -144,7 +138,7 @@ class FaultyFlight(GainEffect):
             noise_sd_db=float(np.median([scatter_db for _, scatter_db, _ in worst])))]
 
     @override
-    def propose_like(self, view: ResidualView) -> list[Params]:
+    def propose_for_fold(self, view: ResidualView) -> list[Params]:
         on_flight = flight_mask(view.links, self.params.receiver, self.params.flight)
         return [self.params] if on_flight.sum() >= MIN_LINKS else []
 

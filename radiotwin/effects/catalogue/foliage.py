@@ -15,15 +15,15 @@ from typing_extensions import override
 from radiotwin.effects.arrays import ends_above, ends_above_ground
 from radiotwin.effects.base import GainEffect, ResidualView
 from radiotwin.effects.boxes import (
-    BESIDE_UNKNOWN,
     CELL_M,
+    ESTIMATED_PLACES,
     HEIGHTS_M,
     Box,
     back_project,
     best_cells,
     cross,
     devices_through,
-    is_beside_unknown,
+    is_seen_from_estimated_places,
     obstruction_nats,
 )
 from radiotwin.effects.losses import UNKNOWN_MAX_LOSS_DB, max_loss_db
@@ -114,7 +114,7 @@ class Foliage(GainEffect):
     @override
     def contradicted(self, links: Links) -> str | None:
         through = devices_through(self.params.box, links)
-        return BESIDE_UNKNOWN if is_beside_unknown(through, links) else None
+        return ESTIMATED_PLACES if is_seen_from_estimated_places(through, links) else None
 
     @override
     def mark(self, links: Links) -> Mark:

@@ -68,20 +68,15 @@ class _DriftParams(EffectParams):
 
 
 class _GainDrift(GainEffect):
-    """Base of drifts: one receiver or device, in the form that fits its links best.
-
-    Attributes:
-        forms: allowed forms.
-        end: "receiver" or "device".
-    """
+    """Base of drifts: one receiver or device, in the form that fits its links best."""
 
     repeatable = True
     parameter_labels = {"warm_up_db": "excess at switch-on",
                         "warm_up_each_flight_db": "excess at take-off",
                         "ageing_db": "change from first to last", "step_time_s": "time of the step",
                         "time_constant_s": "time constant"}
-    forms: ClassVar[tuple[str, ...]]
-    end: ClassVar[str]
+    forms: ClassVar[tuple[str, ...]]  # that are allowed
+    end: ClassVar[str]  # "receiver" or "device"
     params: _DriftParams
 
     def __init__(self, between_flights: bool = False) -> None:
@@ -134,7 +129,7 @@ class _GainDrift(GainEffect):
         return self._proposals(view, sorted(set(self._members(view.links)) - known))
 
     @override
-    def propose_like(self, view: ResidualView) -> list[Any]:
+    def propose_for_fold(self, view: ResidualView) -> list[Any]:
         # The fold must confirm the drift of this member, not of any other.
         return self._proposals(view, list(self.drifts()))
 
@@ -188,7 +183,7 @@ class _GainDrift(GainEffect):
         return Variation(values, np.full(n, 0.3), np.full(n, 0.0), np.full(n, MAX_LOG_S), varied)
 
     @override
-    def same_as(self, links: Links, parameters: Mapping[str, Parameter]) -> list[str]:
+    def rivals(self, links: Links, parameters: Mapping[str, Parameter]) -> list[str]:
         other = inseparable_end(links, self.end, set(self.drifts()))
         return [] if other is None else [self.name.replace(self.end, other)]
 

@@ -70,7 +70,7 @@ class _GainOffset(GainEffect):
         return self._of_members(view, view.in_group(self._index(view.links)))
 
     @override
-    def propose_like(self, view: ResidualView) -> list[Params]:
+    def propose_for_fold(self, view: ResidualView) -> list[Params]:
         return self._of_members(view, self.params.members)
 
     def _of_members(self, view: ResidualView, among: list[int]) -> list[Params]:
@@ -91,7 +91,7 @@ class _GainOffset(GainEffect):
                        unheard_sd_db=np.where(unknown, self.params.offsets_sd_db, 0.0))
 
     @override
-    def same_as(self, links: Links, parameters: Mapping[str, Parameter]) -> list[str]:
+    def rivals(self, links: Links, parameters: Mapping[str, Parameter]) -> list[str]:
         """Name the offset of the other end, if these links cannot tell which end has it."""
         names = getattr(links, f"{self.end}_names")
         largest = max(self.params.members,

@@ -48,6 +48,7 @@ class GroundReflection(GainEffect):
     acts_on = ("distance", "direction")
     parameter_labels = {"roughness_m": "ground roughness", "ground_m": "ground height"}
     settled_by = "vary the height over open ground"
+    needs_frequency = True
     confused_with = ("antenna_pattern", "wall_reflection")
 
     class Params(EffectParams):
@@ -66,8 +67,8 @@ class GroundReflection(GainEffect):
     @override
     def unavailable(self, links: Links) -> str | None:
         """Return why no ground reflection can be fitted (frequency, or few links in sight)."""
-        if not np.isfinite(links.frequency_hz):
-            return "the frequency is not known; give frequency_hz in devices.csv"
+        if missing := super().unavailable(links):
+            return missing
         if links.los.sum() < MIN_LINKS:
             return f"fewer than {MIN_LINKS} links have line of sight"
         return None

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from radiotwin.effects.arrays import NEPERS, add_power, subsample
+from radiotwin.effects.arrays import NEPERS, subsample
 from radiotwin.effects.base import LevelAt, ReceiverEffect, ResidualView, Term
 from radiotwin.effects.params import Decibels, EffectParams, Estimate, Metres, Parameter, Variation
 from radiotwin.effects.places import Mark
@@ -94,7 +94,7 @@ class Interference(ReceiverEffect):
         return found
 
     @override
-    def propose_like(self, view: ResidualView) -> list[Params]:
+    def propose_for_fold(self, view: ResidualView) -> list[Params]:
         """Propose anew from the fold's residuals, and also the parameters found on all links."""
         return [*self.propose(view), self.params]
 
@@ -104,10 +104,6 @@ class Interference(ReceiverEffect):
         path_db = _path_gain_db(links, params.place_m,
                                 level_at if params.through_channel else None)
         return Term.of_inputs(np.exp((params.level_db + path_db) * NEPERS))
-
-    @override
-    def response(self, level_db: np.ndarray, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return add_power(level_db, inputs)
 
     @override
     def variation(self) -> Variation:

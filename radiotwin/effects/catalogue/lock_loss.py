@@ -60,23 +60,14 @@ MAX_DROP_DB = 80.0  # dynamic range of a good receiver
 
 @dataclass(frozen=True, eq=False)
 class _States:
-    """Mixture of two states over i instants.
+    """Mixture of two states over i instants."""
 
-    Attributes:
-        share: share of the low state.
-        level_db: level of the high state [dB].
-        drop_db: its distance to the low state [dB].
-        scale_db: scale of the errors [dB].
-        low: (i,) posterior probability of the low state.
-        nats: (i,) log-likelihood.
-    """
-
-    share: float
-    level_db: float
-    drop_db: float
-    scale_db: float
-    low: np.ndarray
-    nats: np.ndarray
+    share: float  # of the low state
+    level_db: float  # of the high state
+    drop_db: float  # distance to the low state
+    scale_db: float  # of the errors
+    low: np.ndarray  # (i,) posterior probability of the low state
+    nats: np.ndarray  # (i,) log-likelihood
 
 
 def _find_drops(view: ResidualView, receiver: int,

@@ -20,7 +20,7 @@ from typing_extensions import override
 from radiotwin.effects.arrays import city_of, ends_above, ends_above_ground, subsample
 from radiotwin.effects.base import Effect, GainEffect, LevelAt, ResidualView, Term
 from radiotwin.effects.boxes import (
-    BESIDE_UNKNOWN,
+    ESTIMATED_PLACES,
     HEIGHTS_M,
     Box,
     Crossing,
@@ -29,7 +29,7 @@ from radiotwin.effects.boxes import (
     cross,
     devices_through,
     grid_around,
-    is_beside_unknown,
+    is_seen_from_estimated_places,
     is_seen_from_one_place,
     knife_edge_db,
     near_box,
@@ -80,6 +80,7 @@ class MissingObstacle(GainEffect):
     acts_on = ("device", "device x receiver", "direction", "place")
     settled_by = "fly low on both sides of the suspected place"
     figure = "links"
+    needs_frequency = True
     repeatable = True
     always_exact = True
     confused_with = ("foliage", "antenna_pattern", "device_position_error")
@@ -95,12 +96,6 @@ class MissingObstacle(GainEffect):
             "left on the other paths."))
 
     params: Params
-
-    @override
-    def unavailable(self, links: Links) -> str | None:
-        if not np.isfinite(links.frequency_hz):
-            return "the frequency is not known; give frequency_hz in devices.csv"
-        return None
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
@@ -277,8 +272,8 @@ class MissingObstacle(GainEffect):
     def contradicted(self, links: Links) -> str | None:
         """Return why a building there is impossible or its distance unknown; else None."""
         through = devices_through(self.params.box, links)
-        if is_beside_unknown(through, links):
-            return BESIDE_UNKNOWN
+        if is_seen_from_estimated_places(through, links):
+            return ESTIMATED_PLACES
         if is_seen_from_one_place(through, links):
             return ("it is seen from one place only: how far away it is, and how large, nothing "
                     "tells")

@@ -103,10 +103,6 @@ class NoiseFloor(ReceiverEffect):
         return np.exp(by_receiver_db * NEPERS)[links.receiver]
 
     @override
-    def response(self, level_db: np.ndarray, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return add_power(level_db, inputs)
-
-    @override
     def variation(self) -> Variation:
         """Put the receivers' floors [dB] into a search vector, each searched by itself."""
         params = self.params

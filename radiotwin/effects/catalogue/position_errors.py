@@ -41,15 +41,11 @@ MAX_RECEIVER_MOVE_M = 60.0  # along each axis
 
 
 class _PositionError(MovedEnd):
-    """Base of constant position errors.
-
-    Attributes:
-        step_m, max_move_m: first step and bound of the search along each axis [m].
-    """
+    """Base of constant position errors."""
 
     figure = "links"
-    step_m: ClassVar[float]
-    max_move_m: ClassVar[float]
+    step_m: ClassVar[float]  # first step of the search along each axis
+    max_move_m: ClassVar[float]  # its bound
     params: Any  # with `move_m`
 
     @override
@@ -72,13 +68,37 @@ class _PositionError(MovedEnd):
             follows_paths=self.is_exact)
 
 
-class DevicePositionError(_PositionError):
+class _MovedDevices(_PositionError):
+    """Base of anchors at another position, east and north."""
+
+    step_m, max_move_m = 6.0, MAX_MOVE_M
+
+    def devices(self, links: Links) -> list[int]:
+        """Return the devices that are moved."""
+        return [self.params.device]
+
+    @override
+    def moved(self, links: Links) -> Links:
+        device_m = links.device_m.copy()
+        device_m[self.devices(links), :2] += self.params.move_m
+        return links.with_devices(device_m)
+
+    def positions(self, links: Links, estimate: Estimate, when: str = "") -> dict[str, Parameter]:
+        """Report x and y of each moved device [m]; `when` follows the device's name."""
+        given_m = links.device_m[self.params.device, :2]
+        return {f"{axis}_m[{links.device_names[device]}{when}]": Parameter.normal(
+                    old_m + move_m, sd, "m", Allowed(old_m - MAX_MOVE_M, old_m + MAX_MOVE_M))
+                for device in self.devices(links)
+                for axis, old_m, move_m, sd in zip("xy", given_m, self.params.move_m,
+                                                   estimate.params_sd, strict=True)}
+
+
+class DevicePositionError(_MovedDevices):
     """Wrong position of an anchor and all devices on its mast; each search step finds the worst."""
 
     name = "device_position_error"
     in_words = "a wrong position of the device"
     settled_by = "fly past the device on two sides, close by, or survey it again"
-    step_m, max_move_m = 6.0, MAX_MOVE_M
     acts_on = ("device", "device x receiver", "direction")
     confused_with = ("removed_obstacle", "missing_obstacle", "antenna_pattern",
                      "device_gain_offset", "device_moved")
@@ -116,19 +136,16 @@ class DevicePositionError(_PositionError):
             for device in sorted(masts - known)))
 
     @override
-    def rows(self, links: Links) -> np.ndarray:
-        return np.flatnonzero(np.isin(links.device, site_of(links, self.params.device)))
+    def devices(self, links: Links) -> list[int]:
+        return site_of(links, self.params.device)
 
     @override
-    def moved(self, links: Links) -> Links:
-        device_m = links.device_m.copy()
-        device_m[site_of(links, self.params.device), :2] += self.params.move_m
-        return links.with_devices(device_m)
+    def rows(self, links: Links) -> np.ndarray:
+        return np.flatnonzero(np.isin(links.device, self.devices(links)))
 
     @override
     def correction(self, links: Links) -> Correction:
-        params = self.params
-        return Correction(moves_m=dict.fromkeys(site_of(links, params.device), params.move_m))
+        return Correction(moves_m=dict.fromkeys(self.devices(links), self.params.move_m))
 
     @override
     def mark(self, links: Links) -> Mark:
@@ -154,21 +171,15 @@ class DevicePositionError(_PositionError):
     @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
         """Report the corrected x and y of each device on the mast [m]."""
-        declared_m = links.device_m[self.params.device, :2]
-        return {f"{axis}_m[{links.device_names[device]}]": Parameter.normal(
-                    old_m + move_m, sd, "m", Allowed(old_m - MAX_MOVE_M, old_m + MAX_MOVE_M))
-                for device in site_of(links, self.params.device)
-                for axis, old_m, move_m, sd in zip("xy", declared_m, self.params.move_m,
-                                                   estimate.params_sd, strict=True)}
+        return self.positions(links, estimate)
 
 
-class DeviceMoved(_PositionError):
+class DeviceMoved(_MovedDevices):
     """An anchor at another position from one flight on, or up to one flight."""
 
     name = "device_moved"
     in_words = "a device that was moved between flights"
     settled_by = "survey the device's position before and after each flight"
-    step_m, max_move_m = 6.0, MAX_MOVE_M
     of_groups = True
     acts_on = ("device", "device x flight", "device x receiver", "time")
     confused_with = ("device_position_error", "device_drift", "faulty_flight")
@@ -201,7 +212,7 @@ class DeviceMoved(_PositionError):
                 if nats > MIN_NATS][:1]
 
     @override
-    def propose_like(self, view: ResidualView) -> list[Params]:
+    def propose_for_fold(self, view: ResidualView) -> list[Params]:
         return [self.params] if len(self.rows(view.links)) else []
 
     def _best_move_in_time(self, view: ResidualView, device: int) -> tuple[float, Params]:
@@ -215,9 +226,8 @@ class DeviceMoved(_PositionError):
         before_db = view.level_at(device_links)
         best: tuple[float, int, bool, tuple[float, float]] = (-np.inf, 0, False, (0.0, 0.0))
         for move_m in _moves_around_m():
-            device_m = links.device_m.copy()
-            device_m[device, :2] += move_m
-            change_db = view.level_at(device_links.with_devices(device_m)) - before_db
+            moved = self.with_params(self.Params(device=device, flights=[""], move_m=move_m))
+            change_db = view.level_at(moved.moved(device_links)) - before_db
             nats = np.bincount(place, weights=view.gain_nats(rows, change_db),
                                minlength=len(flights))
             up_to = np.cumsum(nats)
@@ -226,8 +236,8 @@ class DeviceMoved(_PositionError):
                                          (up_to[first - 1], True)):
                     best = max(best, (float(total), first, is_before, move_m))
         total, first, is_before, move_m = best
-        moved = flights[:first] if is_before else flights[first:]
-        names = [str(links.flight_names[flight]) for flight in moved]
+        names = [str(links.flight_names[flight])
+                 for flight in (flights[:first] if is_before else flights[first:])]
         return total * len(device_rows) / len(rows), self.Params(
             device=device, flights=names or [str(links.flight_names[flights[0]])], move_m=move_m)
 
@@ -239,25 +249,15 @@ class DeviceMoved(_PositionError):
                               & np.isin(links.flight, named))
 
     @override
-    def moved(self, links: Links) -> Links:
-        device_m = links.device_m.copy()
-        device_m[self.params.device, :2] += self.params.move_m
-        return links.with_devices(device_m)
-
-    @override
     def is_on_maps(self) -> bool:
         return False
 
     @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
         """Report x and y of the device on the flights when it was elsewhere [m]."""
-        given_m, flights = links.device_m[self.params.device, :2], self.params.flights
-        name = links.device_names[self.params.device]
+        flights = self.params.flights
         when = flights[0] if len(flights) == 1 else f"{flights[0]} to {flights[-1]}"
-        return {f"{axis}_m[{name}, {when}]": Parameter.normal(
-                    old_m + move_m, sd, "m", Allowed(old_m - MAX_MOVE_M, old_m + MAX_MOVE_M))
-                for axis, old_m, move_m, sd in zip("xy", given_m, self.params.move_m,
-                                                   estimate.params_sd, strict=True)}
+        return self.positions(links, estimate, f", {when}")
 
 
 class ReceiverPositionError(_PositionError):
@@ -310,11 +310,9 @@ class ReceiverPositionError(_PositionError):
     @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
         """Report the receiver's true minus given x, y and z [m]."""
-        params = self.params
-        name = links.receiver_names[params.receiver]
-        return {f"true_minus_given_{axis}_m[{name}]": Parameter.normal(
-                    move_m, sd, "m", Allowed(-MAX_RECEIVER_MOVE_M, MAX_RECEIVER_MOVE_M))
-                for axis, move_m, sd in zip("xyz", params.move_m, estimate.params_sd, strict=True)}
+        name = links.receiver_names[self.params.receiver]
+        units = {f"true_minus_given_{axis}_m[{name}]": "m" for axis in "xyz"}
+        return self.variation().parameters(units, estimate.params_sd)
 
 
 def _moves_around_m() -> list[tuple[float, float]]:

@@ -161,6 +161,7 @@ class RoofHeights(GainEffect):
     figure = "histogram"
     is_declared = True
     needs_map = True
+    needs_frequency = True
     is_cause = False
 
     class Params(EffectParams):
@@ -169,12 +170,6 @@ class RoofHeights(GainEffect):
         roofs: tuple[Roof, ...] = Field(description="Roofs, and how much higher they are.")
 
     params: Params
-
-    @override
-    def unavailable(self, links: Links) -> str | None:
-        if missing := super().unavailable(links):
-            return missing
-        return None if np.isfinite(links.frequency_hz) else "the frequency is not known"
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
@@ -259,13 +254,7 @@ def with_model_error(roofs: Sequence[Roof]) -> tuple[Roof, ...]:
 
 
 class _Search:
-    """Coordinate-wise estimate of the roof offsets.
-
-    Args:
-        view: residuals of n links.
-        rows: (r,) links that are used.
-        contrast_db: (r,) level with minus without line of sight by the channel law [dB].
-    """
+    """Coordinate-wise estimate of the roof offsets, from rows (r,) of the links."""
 
     def __init__(self, view: ResidualView, rows: np.ndarray, contrast_db: np.ndarray) -> None:
         links = view.links.select(rows)

@@ -6,15 +6,14 @@ upright transmitting antenna. With a 3D map each path has the gain of its direct
 power on paths that are not followed is fitted and has the mean gain of the pattern.
 """
 
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from radiotwin.effects.antennas import MIN_LINKS, MIN_NATS, BodyFrameEffect, report_patterns
-from radiotwin.effects.arrays import frequent_labels, squares_about_mean
+from radiotwin.effects.antennas import MIN_NATS, BodyFrameEffect, report_patterns
+from radiotwin.effects.arrays import squares_about_mean
 from radiotwin.effects.base import ResidualView
 from radiotwin.effects.params import EffectParams, Estimate, Parameter, ReceiverIndex, quantity
 from radiotwin.links import Links
@@ -56,78 +55,8 @@ def dipole_gain(ray: np.ndarray, axis: np.ndarray) -> np.ndarray:
     return DIRECTIVITY * np.maximum(field**2, MIN_GAIN)
 
 
-class TiltedDipole(BodyFrameEffect):
-    """A tilted dipole for each receiver that fits better with one."""
-
-    name = "antenna_pattern"
-    acts_on = ("receiver", "direction")
-    variant = "tilted dipole of a receiver"
-    in_words = "tilt of the receiver's antenna"
-    parameter_labels = {"lean_azimuth_deg": "azimuth of the tilt, from the heading"}
-    confused_with = ("body_shadowing", "receiver_gain_offset")
-
-    class Params(EffectParams):
-        """Dipoles of receivers."""
-
-        receivers: dict[ReceiverIndex, DipoleParams] = Field(
-            description="Dipole of each receiver, by index.")
-
-    params: Params
-
-    @override
-    def propose(self, view: ResidualView) -> list[Params]:
-        """Propose the tilt of each receiver's dipole, where one fits its residuals clearly."""
-        links, found = view.links, {}
-        usable = links.los & np.isfinite(links.heading_deg)
-        for receiver in frequent_labels(links.receiver, MIN_LINKS):
-            rows = np.flatnonzero((links.receiver == receiver) & usable)
-            dipole = _best_dipole(view, rows) if len(rows) >= MIN_LINKS else None
-            if dipole is not None:
-                found[receiver] = dipole
-        return [self.Params(receivers=found)] if found else []
-
-    @override
-    def gain_db(self, links: Links) -> np.ndarray:
-        """Compute the gain (n,) of the receivers' tilted dipoles on each link [dB]."""
-        offset_db = np.zeros(len(links))
-        for receiver, dipole in self.params.receivers.items():
-            rows = np.flatnonzero((links.receiver == receiver) & np.isfinite(links.heading_deg))
-            arrivals = self.of_links.get(links, receiver,
-                                          partial(_Arrivals.of, links, rows))
-            offset_db[rows] = arrivals.offset_db(dipole)
-        return offset_db
-
-    @override
-    def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
-        return report_patterns(self.params.receivers, estimate.params_sd, links.receiver_names,
-                               with_scattered=links.city is not None)
-
-
-def _best_dipole(view: ResidualView, rows: np.ndarray) -> DipoleParams | None:
-    """Find the trial tilt of a dipole that fits best on straight lines; None if it gains little."""
-    links = view.links.select(rows)
-    length_m = np.linalg.norm(links.offset_m, axis=1, keepdims=True)
-    ray = -(links.offset_m / np.maximum(length_m, 1e-9))
-    residual_db, weight = view.residual_db[rows], view.weight[rows]
-
-    def squares_left(tilt: float, azimuth: float) -> float:
-        gain = dipole_gain(ray, _axis(links.receiver_axes, tilt, azimuth))
-        return squares_about_mean(residual_db - 10 * np.log10(gain), weight)
-
-    best, tilt, azimuth = min((squares_left(tilt, azimuth), tilt, azimuth)
-                              for tilt in TILTS_DEG for azimuth in AZIMUTHS_DEG)
-    if 0.5 * (squares_about_mean(residual_db, weight) - best) > MIN_NATS:
-        return DipoleParams(tilt_deg=tilt, lean_azimuth_deg=azimuth)
-    return None
-
-
 class _Arrivals(NamedTuple):
-    """Directions of arrival of n links at their receivers.
-
-    Attributes:
-        rays: p rays of the paths at the receiver.
-        axes: (n, 3, 3) body axes of the receiver, see `Links.receiver_axes`.
-    """
+    """Rays of n links' paths at their receivers, and the receivers' body axes (n, 3, 3)."""
 
     rays: Rays
     axes: np.ndarray
@@ -138,12 +67,59 @@ class _Arrivals(NamedTuple):
         links = links.select(rows)
         return cls(Rays.of(links, of_device=False), links.receiver_axes)
 
-    def offset_db(self, dipole: DipoleParams) -> np.ndarray:
+    def gain_db(self, dipole: DipoleParams) -> np.ndarray:
         """Compute each link's gain (n,) by a dipole instead of an isotropic antenna [dB]."""
         axis = _axis(self.axes, dipole.tilt_deg, dipole.lean_azimuth_deg)
         gain = dipole_gain(self.rays.direction,
                            axis.astype(self.rays.direction.dtype)[self.rays.link])
         return self.rays.through_antenna_db(gain, dipole.scattered_db, MEAN_GAIN)
+
+
+class TiltedDipole(BodyFrameEffect):
+    """A tilted dipole for each receiver that fits better with one."""
+
+    name = "antenna_pattern"
+    acts_on = ("receiver", "direction")
+    variant = "tilted dipole of a receiver"
+    in_words = "tilt of the receiver's antenna"
+    parameter_labels = {"lean_azimuth_deg": "azimuth of the tilt, from the heading"}
+    confused_with = ("body_shadowing", "receiver_gain_offset")
+    arrivals = _Arrivals.of
+
+    class Params(EffectParams):
+        """Dipoles of receivers."""
+
+        receivers: dict[ReceiverIndex, DipoleParams] = Field(
+            description="Dipole of each receiver, by index.")
+
+    params: Params
+
+    @override
+    def usable(self, links: Links) -> np.ndarray:
+        return links.los & np.isfinite(links.heading_deg)
+
+    @override
+    def best_pattern(self, view: ResidualView, rows: np.ndarray) -> DipoleParams | None:
+        """Find the trial tilt that fits best on straight lines; None if it gains little."""
+        links = view.links.select(rows)
+        length_m = np.linalg.norm(links.offset_m, axis=1, keepdims=True)
+        ray = -(links.offset_m / np.maximum(length_m, 1e-9))
+        residual_db, weight = view.residual_db[rows], view.weight[rows]
+
+        def squares_left(tilt: float, azimuth: float) -> float:
+            gain = dipole_gain(ray, _axis(links.receiver_axes, tilt, azimuth))
+            return squares_about_mean(residual_db - 10 * np.log10(gain), weight)
+
+        best, tilt, azimuth = min((squares_left(tilt, azimuth), tilt, azimuth)
+                                  for tilt in TILTS_DEG for azimuth in AZIMUTHS_DEG)
+        if 0.5 * (squares_about_mean(residual_db, weight) - best) > MIN_NATS:
+            return DipoleParams(tilt_deg=tilt, lean_azimuth_deg=azimuth)
+        return None
+
+    @override
+    def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
+        return report_patterns(self.params.receivers, estimate.params_sd, links.receiver_names,
+                               with_scattered=links.city is not None)
 
 
 def _axis(axes: np.ndarray, tilt_deg: float, azimuth_deg: float) -> np.ndarray:

@@ -259,7 +259,7 @@ def _best_addition(fit: Fit, effect: Effect, like: Effect | None,
                    group: np.ndarray | None = None) -> Fit | None:
     """Compute the result of `add_effect`: fit all proposed parameters, return the likeliest fit."""
     view = fit.view if group is None else fit.view.of_group(group)
-    proposals = effect.propose(view) if like is None else like.propose_like(view)
+    proposals = effect.propose(view) if like is None else like.propose_for_fold(view)
     kinds: dict[Any, list[Effect]] = {}
     for params in proposals:
         proposed = effect.with_params(params)

@@ -3,16 +3,12 @@
     names("judge")                          # of the cases whose worlds are traced
     foreign_case("city01-w0-c2").answer     # what neither measurements nor scene says
     foreign_case("city01-w0-c2", hidden=False)   # the oracle's: the same campaign with nothing hidden
-
-    python -m tests.undeclared.foreign.cases city01-w0-c2 FOLDER   # writes measurements and scene, to try them
 """
 
 import atexit
 import json
-import shutil
-import sys
 import zlib
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -68,14 +64,7 @@ class ForeignCase:
 
 
 def names(split: str | None = None) -> list[str]:
-    """Return the names of the cases whose worlds are traced, in the order in which they are.
-
-    Args:
-        split: `calibrate` or `judge`; None: both.
-
-    Raises:
-        ValueError: no such split.
-    """
+    """Return the names of the cases whose worlds are traced, in that order, of a split or of both; ValueError: no such."""
     if split not in (None, *SPLITS):
         raise ValueError(f"split {split!r} does not exist; there are {' and '.join(SPLITS)}")
     return [f"{name}-c{number}" for name in stored() for number in range(CASES)
@@ -93,15 +82,7 @@ def families(name: str) -> tuple[str, ...]:
 
 
 def foreign_case(name: str, hidden: bool = True) -> ForeignCase:
-    """Draw a case from its world's trace.
-
-    Args:
-        name: as of `names`.
-        hidden: False: the same campaign with nothing hidden in it, for the oracle.
-
-    Raises:
-        FileNotFoundError: its world is not traced.
-    """
+    """Draw a case from its world's trace; `hidden` False: the same campaign with nothing hidden in it, for the oracle."""
     at = Scenario.of(name.rpartition("-")[0])
     rng = {purpose: np.random.default_rng([zlib.crc32(f"{name}/{purpose}".encode())])
            for purpose in ("effects", "habits", "noise", "table")}
@@ -173,7 +154,7 @@ def _answer(at: Scenario, habits: Habits, found: list[Hidden], device_m: np.ndar
                 "unmapped": corners([index for index in every if stands[index] and not where.mapped[index]]),
                 "gone": corners([index for index in every if not stands[index] and where.mapped[index]]),
                 "max_depth": where.settings.max_depth, "scattering": where.settings.scattering,
-                "stations": where.campaign.stations, **habits.nuisance()}}
+                "stations": where.campaign.stations, **asdict(habits)}}
 
 
 def _written(at: Scenario, found: list[Hidden]) -> tuple[np.ndarray, np.ndarray]:
@@ -202,14 +183,3 @@ def _change_db(at: Scenario, found: list[Hidden]) -> np.ndarray:
         change_db = change_db + (at.rough_db(at.where.device_m[:-1], at.where.campaign.points_m, at.standing)
                                  - at.rough_db(device_m, written_m, mapped))
     return change_db
-
-
-def write(name: str, folder: Path) -> None:
-    """Write what a user would have of a case: `measurements.csv`, `devices.csv` and the folder `scene`."""
-    one = foreign_case(name)
-    one.measurements.save(folder / "measurements.csv")
-    shutil.copytree(one.scene.folder, folder / "scene", dirs_exist_ok=True)
-
-
-if __name__ == "__main__":
-    write(sys.argv[1], Path(sys.argv[2]))

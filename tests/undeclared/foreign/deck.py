@@ -76,23 +76,12 @@ def deal(split: str) -> dict[str, tuple[str, ...]]:
 
 def makes_sense(family: str, where: World) -> bool:
     """Return whether a family can be seen at all in a world."""
-    campaign = where.campaign
+    campaign, is_rain, is_low = where.campaign, where.frequency_hz > RAIN_HZ, where.frequency_hz < RAIN_HZ
     flights, receivers = campaign.flight.max() + 1, campaign.receiver.max() + 1
-    if family in ("excess_attenuation", "shower"):
-        return where.frequency_hz > RAIN_HZ
-    if family == "receiver_gain_offset":
-        return receivers > 1
-    if family == "antenna_swap":
-        return flights >= 4
-    if family == "faulty_flight":
-        return flights >= 3
-    if family in ("foliage", "standing_waves", "swaying_antenna"):
-        return where.frequency_hz < RAIN_HZ
-    if family == "receiver_clock_offset":
-        return any(kind in ("drive", "fly") for kind in campaign.kind)
-    if family == "device_gain_offset":
-        return len(where.device_m) > 4
-    return True
+    return {"excess_attenuation": is_rain, "shower": is_rain, "foliage": is_low, "standing_waves": is_low,
+            "swaying_antenna": is_low, "receiver_gain_offset": receivers > 1, "antenna_swap": flights >= 4,
+            "faulty_flight": flights >= 3, "device_gain_offset": len(where.device_m) > 4,
+            "receiver_clock_offset": any(kind in ("drive", "fly") for kind in campaign.kind)}.get(family, True)
 
 
 def write_dealt() -> None:

@@ -15,10 +15,10 @@ def either(rng: np.random.Generator, low: float, high: float) -> float:
     return float(rng.choice([-1, 1])) * between(rng, low, high)
 
 
-def receiver(at: Scenario, rng: np.random.Generator) -> tuple[int, str]:
-    """Draw a receiver: its number and its name."""
+def receiver(at: Scenario, rng: np.random.Generator) -> tuple[str, np.ndarray]:
+    """Draw a receiver: its name, and which links (n,) are its own."""
     number = int(rng.integers(at.where.campaign.receiver.max() + 1))
-    return number, f"r{number + 1}"
+    return f"r{number + 1}", at.of_links("receiver") == number
 
 
 def device(at: Scenario, rng: np.random.Generator) -> tuple[int, str]:

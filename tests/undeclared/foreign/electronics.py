@@ -8,9 +8,9 @@ from tests.undeclared.foreign.scenario import Hidden, Scenario
 
 def receiver_gain_offset(at: Scenario, rng: np.random.Generator) -> Hidden:
     """A receiver reads too much, or its cable takes too much."""
-    number, name = receiver(at, rng)
+    name, mine = receiver(at, rng)
     offset_db = either(rng, 0.8, 9)
-    change_db = (at.of_links("receiver") == number) * offset_db
+    change_db = mine * offset_db
     truth = {"receiver": name, "offset_db": round(offset_db, 3)}
     if offset_db < 0:
         return Hidden("receiver_gain_offset", True, truth, air_db=change_db)
@@ -42,8 +42,7 @@ def _course(at: Scenario, rng: np.random.Generator) -> tuple[dict, np.ndarray]:
 
 def receiver_drift(at: Scenario, rng: np.random.Generator) -> Hidden:
     """A receiver's gain changes in time."""
-    (number, name), (truth, change_db) = receiver(at, rng), _course(at, rng)
-    mine = at.of_links("receiver") == number
+    (name, mine), (truth, change_db) = receiver(at, rng), _course(at, rng)
     return Hidden("receiver_drift", True, {"receiver": name} | truth, reads=lambda level_db: level_db + mine * change_db)
 
 
@@ -55,8 +54,7 @@ def device_drift(at: Scenario, rng: np.random.Generator) -> Hidden:
 
 def receiver_saturation(at: Scenario, rng: np.random.Generator) -> Hidden:
     """A receiver's strongest readings come out too low: a hard limit of a converter, or a soft one."""
-    number, name = receiver(at, rng)
-    mine = at.of_links("receiver") == number
+    name, mine = receiver(at, rng)
     heard = mine & np.isfinite(at.plain_db)
     most_db = float(np.quantile(at.plain_db[heard], 1 - between(rng, 0.05, 0.5)))
     kind = str(rng.choice(["hard", "soft"]))
@@ -74,8 +72,7 @@ def receiver_saturation(at: Scenario, rng: np.random.Generator) -> Hidden:
 
 def noise_floor(at: Scenario, rng: np.random.Generator) -> Hidden:
     """A receiver's readings contain its own noise."""
-    number, name = receiver(at, rng)
-    mine = at.of_links("receiver") == number
+    name, mine = receiver(at, rng)
     floor_db = float(np.quantile(at.plain_db[mine & np.isfinite(at.plain_db)], between(rng, 0.1, 0.5)))
     return Hidden("noise_floor_censoring", True, {"receiver": name, "floor_db": round(floor_db, 2)},
                   adds_db=np.where(mine, floor_db, -np.inf))
@@ -83,14 +80,14 @@ def noise_floor(at: Scenario, rng: np.random.Generator) -> Hidden:
 
 def lock_loss(at: Scenario, rng: np.random.Generator) -> Hidden:
     """A receiver loses lock: for a few readings in a row its levels drop, or are blank."""
-    number, name = receiver(at, rng)
+    name, mine = receiver(at, rng)
     share, run = between(rng, 0.06, 0.4), rng.uniform(2, 9)
     state = np.zeros(at.points, dtype=bool)
     for point in range(1, at.points):  # two states in turn, whose mean lengths give the share
         leave = 1 / run if state[point - 1] else share / (1 - share) / run
         state[point] = state[point - 1] ^ (rng.random() < leave)
-    out = state[at.point] & (at.of_links("receiver") == number)
-    truth = {"receiver": name, "lost_share": round(float(out.sum() / (at.of_links("receiver") == number).sum()), 3)}
+    out = state[at.point] & mine
+    truth = {"receiver": name, "lost_share": round(float(out.sum() / mine.sum()), 3)}
     if rng.random() < 0.5:
         return Hidden("lock_loss", True, truth | {"kind": "blank"}, lost=out)
     drop_db = rng.uniform(10, 40)
@@ -121,18 +118,18 @@ def faulty_flight(at: Scenario, rng: np.random.Generator) -> Hidden:
 
 def episode(at: Scenario, rng: np.random.Generator) -> Hidden:
     """Between two times levels are lower, of one receiver or of all."""
-    (number, name), everyone = receiver(at, rng), rng.random() < 0.5
+    (name, mine), everyone = receiver(at, rng), rng.random() < 0.5
     start_s, end_s = times(at, rng, rng.uniform(0.05, 0.3))
     loss_db, time_s = between(rng, 3, 15), at.of_links("time_s")
-    during = (time_s >= start_s) & (time_s < end_s) & (everyone | (at.of_links("receiver") == number))
+    during = (time_s >= start_s) & (time_s < end_s) & (everyone | mine)
     return Hidden("episode", True, {"receiver": "all" if everyone else name, "start_s": start_s, "end_s": end_s,
                                     "loss_db": round(loss_db, 2)}, air_db=-loss_db * during)
 
 
 def agc_hysteresis(at: Scenario, rng: np.random.Generator) -> Hidden:
     """A receiver's attenuator goes in above one level and out below a lower one; readings are corrected badly."""
-    number, name = receiver(at, rng)
-    rows = np.flatnonzero(at.of_links("receiver") == number)
+    name, mine = receiver(at, rng)
+    rows = np.flatnonzero(mine)
     heard_db = at.plain_db[rows][np.isfinite(at.plain_db[rows])]
     upper_db, width_db, wrong_db = float(np.quantile(heard_db, rng.uniform(0.5, 0.85))), rng.uniform(6, 15), either(rng, 2.5, 8)
     order = rows[np.lexsort((at.device[rows], at.of_links("time_s")[rows], at.device[rows]))]
@@ -147,9 +144,9 @@ def agc_hysteresis(at: Scenario, rng: np.random.Generator) -> Hidden:
 
 def heater_cycle(at: Scenario, rng: np.random.Generator) -> Hidden:
     """A heater near a receiver's amplifier goes on and off: its gain follows as a saw-tooth."""
-    number, name = receiver(at, rng)
+    name, mine = receiver(at, rng)
     size_db, period_s = between(rng, 2, 7), rng.uniform(40, 400)
     tooth = np.abs((at.of_links("time_s") / period_s + rng.random()) % 1 * 2 - 1) - 0.5
-    change_db = size_db * tooth * (at.of_links("receiver") == number)
+    change_db = size_db * tooth * mine
     return Hidden("heater_cycle", False, {"receiver": name, "size_db": round(size_db, 2), "period_s": round(period_s)},
                   reads=lambda level_db: level_db + change_db)

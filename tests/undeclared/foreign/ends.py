@@ -37,7 +37,7 @@ def sector_antenna(at: Scenario, rng: np.random.Generator) -> Hidden:
 
 def tilted_dipole(at: Scenario, rng: np.random.Generator) -> Hidden:
     """A short dipole at a receiver, tilted in its body's frame; waves arrive upright, bounced ones less so."""
-    number, name = receiver(at, rng)
+    name, mine = receiver(at, rng)
     tilt_deg, towards_deg = float(rng.choice([0.0, rng.uniform(15, 80)], p=[0.2, 0.8])), rng.uniform(0, 360)
     heading = np.radians(at.of_links("heading_deg") + towards_deg)[at.paths.link]
     tilt = np.radians(tilt_deg)
@@ -49,16 +49,15 @@ def tilted_dipole(at: Scenario, rng: np.random.Generator) -> Hidden:
     across = np.column_stack([-np.sin(azimuth), np.cos(azimuth), np.zeros(len(azimuth))])
     crossed = np.where(at.paths.bounces > 0, 0.15, 0.01)
     power = 1.5 * (((axis * upright).sum(axis=1))**2 * (1 - crossed) + crossed * ((axis * across).sum(axis=1))**2)
-    mine = at.of_links("receiver")[at.paths.link] == number
     return Hidden("antenna_pattern", True,
                   {"kind": "dipole", "receiver": name, "tilt_deg": round(tilt_deg, 1),
                    "tilt_towards_deg": round(towards_deg, 1)},
-                  path_db=np.where(mine, 10 * np.log10(power + 1e-3), 0.0))
+                  path_db=np.where(mine[at.paths.link], 10 * np.log10(power + 1e-3), 0.0))
 
 
 def body_shadowing(at: Scenario, rng: np.random.Generator) -> Hidden:
     """A body beside a receiver's antenna takes most from what comes through it: a smooth lobe in its frame."""
-    number, name = receiver(at, rng)
+    name, mine = receiver(at, rng)
     depth_db, width_deg = between(rng, 3, 20), rng.uniform(30, 75)
     towards_deg, below_deg = rng.uniform(0, 360), rng.uniform(-10, 30)
     elevation, azimuth = at.paths.arrives_rad.T
@@ -66,11 +65,10 @@ def body_shadowing(at: Scenario, rng: np.random.Generator) -> Hidden:
     low = -np.radians(below_deg)
     cosine = np.sin(elevation) * np.sin(low) + np.cos(elevation) * np.cos(low) * np.cos(relative)
     off_deg = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-    mine = at.of_links("receiver")[at.paths.link] == number
     return Hidden("body_shadowing", True, {
         "receiver": name, "depth_db": round(depth_db, 2), "direction_deg": round(towards_deg, 1),
         "below_deg": round(below_deg, 1), "width_deg": round(width_deg, 1)},
-        path_db=-np.where(mine, depth_db * np.exp(-0.5 * (off_deg / width_deg)**2), 0.0))
+        path_db=-np.where(mine[at.paths.link], depth_db * np.exp(-0.5 * (off_deg / width_deg)**2), 0.0))
 
 
 def mover(at: Scenario, rng: np.random.Generator) -> Hidden:
@@ -91,18 +89,17 @@ def mover(at: Scenario, rng: np.random.Generator) -> Hidden:
 
 def antenna_swap(at: Scenario, rng: np.random.Generator) -> Hidden:
     """A receiver flies with a patch that looks ahead and down in some flights, with a whip in the others."""
-    number, name = receiver(at, rng)
-    flights = np.unique(at.where.campaign.flight[at.where.campaign.receiver == number])
+    name, mine = receiver(at, rng)
+    flights = np.unique(at.of_links("flight")[mine])
     patch = rng.permutation(flights)[:max(1, len(flights) // 2)]
     elevation, azimuth = at.paths.arrives_rad.T
     off = np.pi / 2 - azimuth - np.radians(at.of_links("heading_deg")[at.paths.link])
     towards = np.cos(elevation) * np.cos(off) * np.cos(0.5) - np.sin(elevation) * np.sin(0.5)
     patch_db = 10 * np.log10(np.clip(towards, 0.03, 1)**2 * 4.5)
     whip_db = 10 * np.log10(1.5 * np.cos(elevation)**2 + 0.02)
-    mine = (at.of_links("receiver") == number)[at.paths.link]
     is_patch = np.isin(at.of_links("flight"), patch)[at.paths.link]
     return Hidden("antenna_swap", False, {"receiver": name, "flights": [f"f{number + 1}" for number in sorted(patch)]},
-                  path_db=np.where(mine, np.where(is_patch, patch_db, whip_db), 0.0))
+                  path_db=np.where(mine[at.paths.link], np.where(is_patch, patch_db, whip_db), 0.0))
 
 
 def swaying_antenna(at: Scenario, rng: np.random.Generator) -> Hidden:

@@ -13,11 +13,7 @@ ABOVE_ROOF_M = 7.0  # that flights keep: heights of the map are off by a few met
 
 
 class Grounds:
-    """Clearances in a city.
-
-    Args:
-        city: its plan.
-    """
+    """Clearances in a city."""
 
     def __init__(self, city: City):
         self.city = city

@@ -10,27 +10,12 @@ from functools import cache
 
 import numpy as np
 
-from tests.undeclared.shapes import corners_of, fits, turned
+from tests.undeclared.shapes import Building, corners_of, fits, turned
 
 LAYOUTS = ("perimeter", "campus", "highrise", "suburb", "industrial", "village", "slabs", "centre")
 SPLITS = ("calibrate", "judge")
 ROOM_M = 7.5  # between two buildings: walls that a survey misplaced never touch
 GROUND = "asphalt_concrete"
-
-
-@dataclass(frozen=True, eq=False)
-class Building:
-    """A prism.
-
-    Attributes:
-        footprint_m: (k, 2) counter-clockwise [m]; the first corner sees all others.
-        height_m: of its flat roof [m].
-        material: of the ITU table.
-    """
-
-    footprint_m: np.ndarray
-    height_m: float
-    material: str
 
 
 @dataclass(frozen=True, eq=False)

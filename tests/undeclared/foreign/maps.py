@@ -4,14 +4,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import trimesh
 
 from radiotwin.scene.config import Extent, LatticeConfig, RadioConfig, SceneConfig, write_config
-from radiotwin.scene.folder import CityShape, write_city
 from radiotwin.scene.materials import Material, permittivity
 from tests.undeclared.foreign.layouts import GROUND, Building
 from tests.undeclared.foreign.worlds import World
-from tests.undeclared.shapes import prism
+from tests.undeclared.shapes import write_prisms
 
 MARGIN_M = 60.0  # of ground around the extent
 WALLS = ("concrete", "brick", "wood", "glass", "plasterboard", "marble", "metal")
@@ -30,25 +28,19 @@ def write_truth(folder: Path, where: World) -> Path:
                 for index, one in enumerate(where.true) if one is not None]
     names = sorted({name for _, name in standing} | {GROUND})
     materials = {name: _real(name, where, rng) for name in names}
-    _write(folder, where.city.side_m, [(one, materials[name]) for one, name in standing], materials[GROUND])
+    write_prisms(folder, where.city.side_m, MARGIN_M, [(one, materials[name]) for one, name in standing], materials[GROUND])
     return folder / "city.xml"
 
 
 def write_map(folder: Path, where: World, limit_db: float, but: Sequence[int] = (), gone: Sequence[Building] = ()) -> None:
-    """Write the scene folder that a user has.
+    """Write the scene folder that a user has; without the buildings `but`, which stand, and with those that are `gone`.
 
-    Args:
-        folder: existing.
-        where: the world; its map has the buildings of the plan that `where.mapped` says.
-        limit_db: declared limit of detection [dB], or [dBm] where levels are in dBm.
-        but: indices of buildings that stand and that this map lacks.
-        gone: buildings that do not stand and that this map has.
+    `limit_db` is the declared limit of detection [dB], or [dBm] where levels are in dBm.
     """
     buildings = [one for index, one in enumerate(where.city.buildings) if where.mapped[index] and index not in but]
     buildings = sorted([*buildings, *gone], key=lambda one: float(one.footprint_m[0, 0]))  # numbers tell nothing
-    materials = {one.material: Material(one.material, itu=one.material) for one in buildings}
-    _write(folder, where.city.side_m, [(one, materials[one.material]) for one in buildings],
-           Material(GROUND, itu=GROUND))
+    write_prisms(folder, where.city.side_m, MARGIN_M,
+                 [(one, Material(one.material, itu=one.material)) for one in buildings], Material(GROUND, itu=GROUND))
     top_m = float(np.ceil(max(40.0, where.campaign.points_m[:, 2].max())))
     write_config(SceneConfig(
         name="city", radio=RadioConfig(frequency_hz=where.frequency_hz, sensitivity_dbm=round(limit_db, 1)),
@@ -64,13 +56,3 @@ def _real(name: str, where: World, rng: np.random.Generator) -> Material:
                     conductivity_s_per_m=float(conductivity * np.exp(rng.uniform(-0.7, 0.7))),
                     thickness_m=float(rng.uniform(0.05, 0.5)), scattering_coefficient=min(scattering, 0.6),
                     xpd_coefficient=0.1)
-
-
-def _write(folder: Path, side_m: float, solids: list[tuple[Building, Material]], ground: Material) -> None:
-    low, high = -MARGIN_M, side_m + MARGIN_M
-    plane = trimesh.Trimesh([[low, low, 0], [high, low, 0], [high, high, 0], [low, high, 0]],
-                            [[0, 1, 2], [0, 2, 3]], process=False)
-    shapes = [CityShape("ground", plane, ground)]
-    shapes += [CityShape(f"b{number:03d}", prism(one.footprint_m, one.height_m), material)
-               for number, (one, material) in enumerate(solids)]
-    write_city(folder, shapes)

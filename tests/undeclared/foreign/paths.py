@@ -43,13 +43,7 @@ class Paths:
 
 
 class Tracer:
-    """Sionna RT on one city.
-
-    Args:
-        xml_path: of the city as it stands.
-        frequency_hz: of its radio.
-        settings: of the world.
-    """
+    """Sionna RT on one city as it stands."""
 
     def __init__(self, xml_path: Path, frequency_hz: float, settings: Settings):
         self._city = load_city(xml_path, frequency_hz)

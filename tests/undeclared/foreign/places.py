@@ -5,8 +5,8 @@ import numpy as np
 from tests.undeclared.foreign.draws import between, device
 from tests.undeclared.foreign.grounds import Grounds
 from tests.undeclared.foreign.layouts import Building
-from tests.undeclared.foreign.scenario import Hidden, Scenario, blocked
-from tests.undeclared.shapes import corners_of, distance_m, fits, inside, turned
+from tests.undeclared.foreign.scenario import Hidden, Scenario
+from tests.undeclared.shapes import blocked_alone, corners_of, distance_m, fits, inside, turned
 
 
 def missing_obstacle(at: Scenario, rng: np.random.Generator) -> Hidden:
@@ -16,8 +16,7 @@ def missing_obstacle(at: Scenario, rng: np.random.Generator) -> Hidden:
     a_m, b_m = at.where.device_m[at.device[some]], at.where.campaign.points_m[at.point[some]]
     able = [(index, one) for index, one in enumerate(at.where.true) if one is not None and at.where.mapped[index]
             and not inside(at.where.device_m[:, :2], plan[index].footprint_m).any()]
-    blocks = np.array([blocked([one], a_m, b_m) for _, one in able])
-    alone = (blocks & (blocks.sum(axis=0) == 1)).sum(axis=1)
+    alone = blocked_alone([one for _, one in able], a_m, b_m)
     index, one = able[int(rng.choice(np.argsort(-alone, kind="stable")[:6]))]
     return Hidden("missing_obstacle", True, _building(one), map_lacks=(index,))
 

@@ -1,6 +1,6 @@
 """What receivers make of levels, and what a campaign's table keeps: noise, steps, limits, blanks, gaps and clocks."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
@@ -43,10 +43,6 @@ class Habits:
     sent_dbm: float | None
     place_m: float
     unknown: int
-
-    def nuisance(self) -> dict:
-        """Return all of them, for the answer."""
-        return asdict(self)
 
 
 def draw_habits(at: Scenario, needs_time: bool, needs_attitude: bool, rng: np.random.Generator) -> Habits:

@@ -6,12 +6,11 @@ from functools import cached_property
 
 import numpy as np
 
-from radiotwin.scene.citymap import CityMap
 from tests.undeclared.foreign.layouts import Building
 from tests.undeclared.foreign.paths import LIGHT_M_S, Paths
 from tests.undeclared.foreign.store import load
 from tests.undeclared.foreign.worlds import World, world
-from tests.undeclared.shapes import prism
+from tests.undeclared.shapes import blocked
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,14 +140,6 @@ class Scenario:
         space_db = 20 * np.log10(LIGHT_M_S / (4 * np.pi * self.where.frequency_hz * np.linalg.norm(way_m, axis=1)))
         shadowed = ~self.direct & np.isfinite(self.plain_db)
         return float(np.median((space_db - self.plain_db)[shadowed])) if shadowed.any() else 20.0
-
-
-def blocked(buildings: list[Building], a_m: np.ndarray, b_m: np.ndarray) -> np.ndarray:
-    """(n,) whether a building stands between points (n, 3)."""
-    solids = [prism(one.footprint_m, one.height_m) for one in buildings]
-    offsets = np.cumsum([0] + [len(one.vertices) for one in solids])
-    faces = np.concatenate([one.faces + offset for one, offset in zip(solids, offsets)])
-    return ~CityMap(np.concatenate([one.vertices for one in solids]), faces).line_of_sight(a_m, b_m)
 
 
 def _sums_db(link: np.ndarray, power_db: np.ndarray, links: int) -> np.ndarray:

@@ -27,12 +27,7 @@ def _path(name: str) -> Path:
 
 
 def save(where: World, paths: list[Paths]) -> None:
-    """Write the paths of a world.
-
-    Args:
-        where: the world.
-        paths: of the links of each of its k devices with its p points.
-    """
+    """Write the paths of a world: those of each of its devices with its points."""
     points = len(where.campaign.points_m)
     counts = np.concatenate([np.bincount(one.link, minlength=points) for one in paths])
     power, leaves, arrives, first, last, bounces = (
@@ -57,12 +52,7 @@ def save(where: World, paths: list[Paths]) -> None:
 
 @lru_cache(8)
 def load(name: str) -> Paths:
-    """Read the paths of a world; link = device * p + point.
-
-    Raises:
-        FileNotFoundError: the world is not traced.
-        ValueError: it was traced for other positions than it has now.
-    """
+    """Read the paths of a world; link = device * p + point. ValueError: traced for other positions than it has now."""
     where = world(name)
     with np.load(_path(name), allow_pickle=False) as archive:
         content = dict(archive.items())

@@ -5,11 +5,10 @@ from functools import cache
 
 import numpy as np
 
-from radiotwin.scene.citymap import CityMap
 from tests.undeclared.foreign.campaigns import Campaign, draw_campaign
 from tests.undeclared.foreign.grounds import Grounds
 from tests.undeclared.foreign.layouts import CITIES, Building, City, city
-from tests.undeclared.shapes import inside, prism
+from tests.undeclared.shapes import blocked_alone, inside
 
 WORLDS = 3  # of each city
 DEVICES = 7  # declared ones; one more is traced, which nobody declares
@@ -137,9 +136,7 @@ def _influence(where: City, device_m: np.ndarray, points_m: np.ndarray) -> tuple
     """Return the building to take away, and how many links each building of the plan blocks alone."""
     some_m = points_m[::4]
     a_m, b_m = np.repeat(device_m[:-1], len(some_m), axis=0), np.tile(some_m, (len(device_m) - 1, 1))
-    solids = [prism(one.footprint_m, one.height_m) for one in where.buildings]
-    blocked = np.array([~CityMap(one.vertices, one.faces).line_of_sight(a_m, b_m) for one in solids])
-    alone = (blocked & (blocked.sum(axis=0) == 1)).sum(axis=1)
+    alone = blocked_alone(where.buildings, a_m, b_m)
     own_roof = [inside(device_m[:, :2], one.footprint_m).any() for one in where.buildings]
     order = [index for index in np.argsort(-alone, kind="stable") if not own_roof[index]]
     return int(order[2]), np.where(own_roof, 10**6, alone)
