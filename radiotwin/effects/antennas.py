@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from radiotwin.effects.arrays import frequent_labels, one_hot
+from radiotwin.effects.arrays import frequent_anchors, frequent_labels, one_hot
 from radiotwin.effects.base import Effect, GainEffect, LevelAt, ResidualView, Term
 from radiotwin.effects.params import (
     Allowed,
@@ -238,7 +238,7 @@ class SectorEffect(GainEffect):
 
     @override
     def unavailable(self, links: Links) -> str | None:
-        if not eligible_devices(links):
+        if not frequent_anchors(links, MIN_LINKS):
             return f"no device of known position has {MIN_LINKS} links"
         return None
 
@@ -261,12 +261,3 @@ class SectorEffect(GainEffect):
             "sector antenna", pattern.azimuth_deg, pattern.beamwidth_deg,
             partial(sector_pattern_db, pattern=pattern.model_copy(update={"azimuth_deg": 0.0})))
             for device, pattern in self.params.devices.items()})
-
-
-def eligible_devices(links: Links) -> list[int]:
-    """List the devices with enough links and a declared position.
-
-    A device that these measurements located wrongly may seem to have a directive antenna.
-    """
-    return [device for device in frequent_labels(links.device, MIN_LINKS)
-            if device in links.anchors]

@@ -99,6 +99,14 @@ def frequent_labels(index: np.ndarray, minimum: int) -> list[int]:
     return [int(value) for value, count in zip(values, counts, strict=True) if count >= minimum]
 
 
+def frequent_anchors(links: Links, minimum: int) -> list[int]:
+    """List the devices of declared position with at least `minimum` links, in order.
+
+    A device that these links located wrongly may seem to stand elsewhere or to have an antenna.
+    """
+    return [device for device in frequent_labels(links.device, minimum) if device in links.anchors]
+
+
 def squares_about_mean(values: np.ndarray, weight: np.ndarray) -> float:
     """Compute the weighted sum of squares of values (n,) about their weighted mean."""
     return weight @ (values - weight @ values / weight.sum()) ** 2

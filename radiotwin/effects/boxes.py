@@ -24,6 +24,7 @@ CHUNK, MAX_POINTS = 2000, 4_000_000  # links, and their points, per pass: bounds
 P_MISS = 0.4  # probability that a link through a cell misses the box in it, which is smaller
 MIN_SHARE = 0.1  # share of the links through a box below which they count as none
 GRAZING_DB = 6.0  # loss at a knife edge that the ray just touches
+NEAR_M = 25.0  # links whose ground tracks are farther away keep their level, also the exact one
 SAME_PLACE_M = 10.0  # largest distance between devices of one mast
 ESTIMATED_PLACES = ("only links of devices whose positions are estimated pass it: they may be "
                   "elsewhere")
@@ -217,9 +218,14 @@ def is_seen_from_one_place(through: np.ndarray, links: Links) -> bool:
 
 
 def near_box(box: Box, a_m: np.ndarray, b_m: np.ndarray, within_m: float) -> np.ndarray:
-    """Check which links (n,) have a ground track within some distance of a box [m]."""
+    """Check which lines (n,) have a ground track within some distance of a box [m]."""
     larger = box._replace(length_m=box.length_m + 2 * within_m, width_m=box.width_m + 2 * within_m)
     return np.isfinite(cross(larger, a_m, b_m).left_m)
+
+
+def links_near(box: Box, links: Links, within_m: float = NEAR_M) -> np.ndarray:
+    """Check which links (n,) pass so near to a box that their paths may change."""
+    return near_box(box, links.device_m[links.device], links.receiver_m, within_m)
 
 
 def obstruction_nats(residual_db: np.ndarray, scale_db: np.ndarray,

@@ -49,6 +49,14 @@ DIGESTS = {
     "foliage 0": "319c44754067ab3a",
     "antenna_pattern 0": "78d5ebf4844857f2",
     "device_position_error 0": "766570170640eaf3",
+    "open 0": "93bf8d8b6edc008b",
+    "open 14": "5055e71ecc8974a7",
+    "open 28": "444062a23b98d17b",
+    "foreign city00-w0-c0": "b46d6a3f5d41461b",
+    "foreign city06-w0-c1": "1b509aa8b4d331c7",
+    "foreign city13-w0-c2": "2d4d072390be0d64",
+    "foreign city14-w1-c0": "7fdc8f49ffcb8696",
+    "foreign city05-w2-c1": "4737afc1a3c36e6e",
 }
 
 

@@ -123,6 +123,7 @@ class BodyShadowing(BodyFrameEffect):
                             azimuth_deg=float(azimuth_deg[number]),
                             elevation_deg=float(elevation_deg[number]), width_deg=width_deg)
         return best
+
     @override
     def propose_for_fold(self, view: ResidualView) -> list[Params]:
         """Propose anew from the fold's residuals, and also the parameters found on all links."""

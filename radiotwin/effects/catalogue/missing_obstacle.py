@@ -22,6 +22,7 @@ from radiotwin.effects.base import Effect, GainEffect, LevelAt, ResidualView, Te
 from radiotwin.effects.boxes import (
     ESTIMATED_PLACES,
     HEIGHTS_M,
+    NEAR_M,
     Box,
     Crossing,
     back_project,
@@ -32,6 +33,7 @@ from radiotwin.effects.boxes import (
     is_seen_from_estimated_places,
     is_seen_from_one_place,
     knife_edge_db,
+    links_near,
     near_box,
     obstruction_nats,
     stands_on,
@@ -61,7 +63,6 @@ MAX_BUILT = 0.15  # largest share of its footprint and margin that is built on t
 AROUND_M = 3.0  # that margin: a box along a wall is an error of the wall, as outlines are off
 GRID, MIN_BUILT_M = 9, 2.0  # points along each side of the footprint, and least height of a roof
 REACH_M, MAX_LINKS = 30.0, 3000  # shapes are tested on links so near to a cell, so many at most
-NEAR_M = 25.0  # links whose ground tracks are farther away keep their level, also the exact one
 MARGIN_M = 10.0  # paths of links within NEAR_M plus this are followed at once, for several boxes
 TURNS_DEG = (-20.0, 20.0)  # further start values: quick levels determine the turn poorly
 LOSSES_DB = (8.0, 12.0, 16.0, 20.0, 25.0, 30.0)  # loss of an obstructed link, equally probable
@@ -160,7 +161,7 @@ class MissingObstacle(GainEffect):
         offset_db = np.zeros(len(links))
         if self.is_exact:
             city = city_of(links, self.name)
-            rows = np.flatnonzero(self._near(links, self.params.box))
+            rows = np.flatnonzero(links_near(self.params.box, links))
             near_links = links.select(rows)
             with_box = near_links.with_city(_with_box(city, self.params.box))
             offset_db[rows] = level_at(with_box, True) - level_at(near_links, True)
@@ -190,12 +191,12 @@ class MissingObstacle(GainEffect):
         """Compute the gain (n,), at most 0, by a box that blocks paths followed without it [dB]."""
         from radiotwin.propagation.laws.followed_paths import KnownPaths, UprightBox
 
-        city, rows = city_of(links, self.name), np.flatnonzero(self._near(links, box))
+        city, rows = city_of(links, self.name), np.flatnonzero(links_near(box, links))
         known = self.of_links.get(links, "paths", lambda: KnownPaths(links.geometry, city))
         level_db = self.of_links.get(links, (level_at, "levels"),
                                    lambda: np.full(len(links), np.nan))
         if np.isnan(level_db[rows]).any():
-            around = self._near(links, box, NEAR_M + MARGIN_M) & np.isnan(level_db)
+            around = links_near(box, links, NEAR_M + MARGIN_M) & np.isnan(level_db)
             level_db[around] = level_at(links.select(around), True)
             known.follow(np.flatnonzero(around))
         top_m = float(city.ground_height_m(*box[:2])) + box.height_m
@@ -215,13 +216,9 @@ class MissingObstacle(GainEffect):
         offset_db[rows] = 10 * np.log10(np.clip(share, 10 ** (-MAX_LOSS_DB / 10), 1.0))
         return offset_db
 
-    def _near(self, links: Links, box: Box, within_m: float = NEAR_M) -> np.ndarray:
-        """Check which links (n,) pass so near to a box that their paths may change."""
-        return near_box(box, links.device_m[links.device], links.receiver_m, within_m)
-
     @override
     def reach(self, links: Links) -> np.ndarray | None:
-        return None if self.levels == "quick" else self._near(links, self.params.box)
+        return None if self.levels == "quick" else links_near(self.params.box, links)
 
     def _shadow_db(self, links: Links, level_at: LevelAt, by_class: bool) -> np.ndarray:
         """Compute the change of level (n,) from losing the line of sight [dB]; cached.

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from radiotwin.effects.arrays import frequent_labels, subsample
+from radiotwin.effects.arrays import frequent_anchors, frequent_labels, subsample
 from radiotwin.effects.base import ResidualView
 from radiotwin.effects.moves import MAX_ENDS, MAX_PROPOSE_LINKS, MIN_LINKS, MIN_NATS, MovedEnd
 from radiotwin.effects.params import (
@@ -116,7 +116,7 @@ class DevicePositionError(_MovedDevices):
     @override
     def unavailable(self, links: Links) -> str | None:
         """Return why no device can be moved (none of known position, or too many); else None."""
-        devices = _movable_anchors(links)
+        devices = frequent_anchors(links, MIN_LINKS)
         if not devices:
             return f"no anchor has {MIN_LINKS} links"
         if len(devices) > MAX_ENDS:
@@ -129,7 +129,7 @@ class DevicePositionError(_MovedDevices):
         links = view.links
         known = {other for device in view.found_params(self.name, "device")
                  for other in site_of(links, device)}
-        masts = {min(site_of(links, device)) for device in _movable_anchors(links)
+        masts = {min(site_of(links, device)) for device in frequent_anchors(links, MIN_LINKS)
                  if device in view.in_group(links.device)}
         return self.best_move(view, (
             [self.Params(device=device, move_m=move_m) for move_m in _moves_around_m()]
@@ -196,7 +196,7 @@ class DeviceMoved(_MovedDevices):
 
     @override
     def unavailable(self, links: Links) -> str | None:
-        if not _movable_anchors(links):
+        if not frequent_anchors(links, MIN_LINKS):
             return f"no anchor has {MIN_LINKS} links"
         return None if len(np.unique(links.flight)) > 1 else "there is one flight"
 
@@ -207,7 +207,7 @@ class DeviceMoved(_MovedDevices):
         if view.group is None:
             return []
         found = [self._best_move_in_time(view, device) for device in view.in_group(links.device)
-                 if device in _movable_anchors(links)]
+                 if device in frequent_anchors(links, MIN_LINKS)]
         return [params for nats, params in sorted(found, key=lambda pair: -pair[0])
                 if nats > MIN_NATS][:1]
 
@@ -328,9 +328,3 @@ def flights_by_time(links: Links) -> list[int]:
     known = np.isfinite(links.time_s).all() and not links.time_restarts
     return sorted(flights.tolist(), key=lambda flight: float(
         links.time_s[links.flight == flight].min()) if known else flight)
-
-
-def _movable_anchors(links: Links) -> list[int]:
-    """List anchors with enough links; other devices were located by these links themselves."""
-    return [device for device in frequent_labels(links.device, MIN_LINKS)
-            if device in links.anchors]

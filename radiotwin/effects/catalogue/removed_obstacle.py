@@ -18,7 +18,7 @@ from radiotwin.effects.boxes import (
     Box,
     building_height_sds_m,
     buildings,
-    near_box,
+    links_near,
     obstruction_nats,
 )
 from radiotwin.effects.params import EffectParams, Estimate, Metres, Parameter
@@ -37,7 +37,6 @@ FLAT_M = 0.5  # least height of a lowered building
 # Very strong evidence (Kass and Raftery 1995, 'Bayes factors', J. Am. Stat. Assoc. 90, Sec. 3.2).
 MIN_LEAD_NATS = 5.0
 SAME_M = 1.0  # largest distance between centres of the same building
-NEAR_M = 25.0  # links whose ground tracks are farther away keep their level, also the exact one
 
 
 class RemovedObstacle(GainEffect):
@@ -95,7 +94,7 @@ class RemovedObstacle(GainEffect):
         """Return the change of levels near the building if the map does not have it [dB]."""
         offset_db, with_it = np.zeros(len(links)), city_of(links, self.name)
         city, box = _without(with_it, self.params.building)
-        rows = _near(links, box)
+        rows = np.flatnonzero(links_near(box, links))
         near_links = links.select(rows)
         offset_db[rows] = level_at(near_links.with_city(city), True) - level_at(near_links, True)
         return Term.of_offset(offset_db)
@@ -154,15 +153,10 @@ class RemovedObstacle(GainEffect):
 def _gain_nats(view: ResidualView, building: int, other: CityMap) -> float:
     """Compute the log-likelihood gain if a map that differs in one building were right [nats]."""
     assert view.links.city is not None
-    rows = _near(view.links, _without(view.links.city, building)[1])
+    rows = np.flatnonzero(links_near(_without(view.links.city, building)[1], view.links))
     near_links = view.links.select(rows)
     change_db = view.level_at(near_links.with_city(other), True) - view.level_at(near_links, True)
     return float(view.gain_nats(rows, change_db).sum())
-
-
-def _near(links: Links, box: Box) -> np.ndarray:
-    """List the rows of links that pass near a box."""
-    return np.flatnonzero(near_box(box, links.device_m[links.device], links.receiver_m, NEAR_M))
 
 
 def only_blocker(links: Links) -> np.ndarray:

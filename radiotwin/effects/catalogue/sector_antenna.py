@@ -10,16 +10,16 @@ from radiotwin.effects.antennas import (
     BEAMWIDTHS_DEG,
     FRONT_TO_BACK_DB,
     MAX_PROPOSE_LINKS,
+    MIN_LINKS,
     MIN_NATS,
     VERTICALS_DEG,
     Departures,
     SectorEffect,
     SectorPattern,
-    eligible_devices,
     report_patterns,
     vary_patterns,
 )
-from radiotwin.effects.arrays import subsample
+from radiotwin.effects.arrays import frequent_anchors, subsample
 from radiotwin.effects.base import ResidualView
 from radiotwin.effects.params import Estimate, Parameter, Variation, quantities
 from radiotwin.effects.patterns import Pattern, members
@@ -42,7 +42,7 @@ class SectorAntenna(SectorEffect):
         """Propose a sector antenna for the device that gains most, and for all on its mast."""
         known = {device for devices in view.found_params(self.name, "devices")
                  for device in devices}
-        devices = sorted((set(eligible_devices(view.links)) - known)
+        devices = sorted((set(frequent_anchors(view.links, MIN_LINKS)) - known)
                          & set(view.in_group(view.links.device)))
         patterns = {straight: _best_patterns(view, devices, straight)
                     for straight in ([False, True] if view.links.city is not None else [False])}
