@@ -144,7 +144,7 @@ class LoopData:
         before_db: (n,) held-out prediction of the base alone [dB]; NaN: none.
         after_db: (n,) held-out prediction with all effects that a map can contain [dB].
         changed: whether anything was added to the base.
-        kept: names of the candidates that were kept, in order, without what belongs to the base.
+        added: names of the effects that were added to the base, in the order in which they were.
         drivers: variables that the residual depends on, those before the effects first.
         effects: the effects that were found.
         interpolated_db: (n,) held-out contribution of correlated shadowing [dB], where it is kept.
@@ -155,7 +155,7 @@ class LoopData:
     before_db: np.ndarray
     after_db: np.ndarray
     changed: bool
-    kept: list[str]
+    added: list[str]
     drivers: list[str]
     effects: list[EffectData]
     interpolated_db: np.ndarray | None

@@ -79,28 +79,18 @@ def variable_figure(effect: EffectData, background: MapBackground) -> Figure:
     if share < MIN_SHARE:
         return contribution_map_figure(effect.contribution_db, background)
     value, label = effect.links.on_axis(name, effect.variables[name])
-    figure, axes = _grid(len(effect.panels()))
-    for number, (ax, (title, rows)) in enumerate(zip(axes, effect.panels())):
-        measured = effect.residual_db
-        _draw_means(ax, effect, rows, value, measured, effect.contribution_db,
-                    "mean residual without the effect")
-        ax.axhline(0, color="0.6", linewidth=0.8)
-        ax.set(title=plain(title), xlabel=label, ylabel="residual [dB]" if number % 3 == 0 else "")
-    return _with_legend(figure, axes, effect)
+    return _means_figure(effect, value, effect.residual_db, effect.contribution_db,
+                         ("mean residual without the effect", label, "residual [dB]"),
+                         lambda ax, _: ax.axhline(0, color="0.6", linewidth=0.8))
 
 
 def response_figure(effect: EffectData, _: MapBackground) -> Figure:
     """Draw readings over the level predicted without the effect, and a linear receiver's line."""
     unit, predicted = effect.links.level_unit, effect.without_db
-    figure, axes = _grid(len(effect.panels()))
-    for number, (ax, (title, rows)) in enumerate(zip(axes, effect.panels())):
-        fitted = _draw_means(ax, effect, rows, predicted, effect.links.level_db, effect.with_db,
-                             "mean of the readings")
-        ax.plot(fitted.at, fitted.at, color=FITTED, linewidth=1, linestyle=":",
-                label="linear response")
-        ax.set(title=plain(title), xlabel=f"predicted level [{unit}]",
-               ylabel=f"reading [{unit}]" if number % 3 == 0 else "")
-    return _with_legend(figure, axes, effect)
+    return _means_figure(effect, predicted, effect.links.level_db, effect.with_db,
+                         ("mean of the readings", f"predicted level [{unit}]", f"reading [{unit}]"),
+                         lambda ax, fitted: ax.plot(fitted.at, fitted.at, color=FITTED, linewidth=1,
+                                                    linestyle=":", label="linear response"))
 
 
 def pattern_figure(effect: EffectData, _: MapBackground) -> Figure:
@@ -191,34 +181,30 @@ FIGURE_OF_STAGE = {"paths": "histogram", "detection": "intervals", "limit": "int
                    "receiver": "response"}
 
 
-def _draw_means(ax: Axes, effect: EffectData, rows: np.ndarray, value: np.ndarray,
-                measured_db: np.ndarray, fitted_db: np.ndarray, label: str) -> BinMeans:
+def _means_figure(effect: EffectData, value: np.ndarray, measured_db: np.ndarray,
+                  fitted_db: np.ndarray, labels: tuple[str, str, str],
+                  draw_line: Callable[[Axes, BinMeans], object]) -> Figure:
     """Draw measured values of links over a variable: dots, means, and means of the fitted values.
 
-    Args:
-        ax: axes.
-        effect: whose links they are.
-        rows: (r,) row numbers of the links to draw.
-        value: (n,) variable of all links.
-        measured_db: (n,) levels or residuals [dB].
-        fitted_db: (n,) what the model has for each of them [dB].
-        label: of the measured means.
-
-    Returns:
-        Means of the fitted values.
+    `labels` are those of the measured means, of x and of y. `draw_line` adds what the means are
+    compared with, given the fitted ones.
     """
-    rows = rows[np.isfinite(value[rows])]
-    index = bin_index(value[rows], EFFECT_BINS)
-    found, fitted = (bin_means(index, value[rows], each_db[rows], effect.links.block[rows])
-                     for each_db in (measured_db, fitted_db))
-    ax.plot(value[rows], measured_db[rows], ".", color="0.8", markersize=2, zorder=0,
-            rasterized=True)
-    ax.plot(found.at, found.mean, "o", color=BEFORE, markersize=4, label=label)
-    ax.errorbar(found.at, found.mean, found.error, fmt="none", color=BEFORE)
-    ax.plot(fitted.at, fitted.mean, color=AFTER, linewidth=2, label="fitted")
-    ax.set_ylim(_limits(measured_db[rows], np.concatenate([found.mean, fitted.mean])))
-    hide_spines(ax)
-    return fitted
+    figure, axes = _grid(len(effect.panels()))
+    for number, (ax, (title, rows)) in enumerate(zip(axes, effect.panels())):
+        rows = rows[np.isfinite(value[rows])]
+        index = bin_index(value[rows], EFFECT_BINS)
+        found, fitted = (bin_means(index, value[rows], each_db[rows], effect.links.block[rows])
+                         for each_db in (measured_db, fitted_db))
+        ax.plot(value[rows], measured_db[rows], ".", color="0.8", markersize=2, zorder=0,
+                rasterized=True)
+        ax.plot(found.at, found.mean, "o", color=BEFORE, markersize=4, label=labels[0])
+        ax.errorbar(found.at, found.mean, found.error, fmt="none", color=BEFORE)
+        ax.plot(fitted.at, fitted.mean, color=AFTER, linewidth=2, label="fitted")
+        ax.set_ylim(_limits(measured_db[rows], np.concatenate([found.mean, fitted.mean])))
+        hide_spines(ax)
+        draw_line(ax, fitted)
+        ax.set(title=plain(title), xlabel=labels[1], ylabel=labels[2] if number % 3 == 0 else "")
+    return _with_legend(figure, axes, effect)
 
 
 def _closed_curve(fitted: BinMeans) -> tuple[np.ndarray, np.ndarray]:

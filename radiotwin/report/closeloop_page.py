@@ -9,7 +9,7 @@ from radiotwin.display import count
 from radiotwin.effects.registry import effects_named
 from radiotwin.report import anomaly_words
 from radiotwin.report import closeloop_words as words
-from radiotwin.report.html import Table, read_picture, write_page
+from radiotwin.report.html import Picture, Table, read_picture, write_page
 from radiotwin.report.labels import (
     apart,
     effect_picture,
@@ -25,35 +25,12 @@ from radiotwin.report.labels import (
     variable_label,
 )
 
-MARKED = " Purple: what was found."  # in captions of figures that show it; so the next two
-FRAMED = " Framed: groups that stand out; dashed: part of their links."
-CONTRIBUTION = " Dashed: contribution of the effects to the prediction."
-MAP = ("residual_map.png", "Residual on the map",
-       "Measured − predicted level on held-out links, at the position of the moving end; red: less "
-       f"was measured than predicted.{MARKED}")
-STEPS = ("waterfall.png", "Error step by step",
-         "RMSE on held-out links, which were used neither to choose nor to fit the model: the base "
-         "alone, the change by each effect, and the result. Horizontal lines: other models, held "
-         "out in the same way, unless they are far worse.")
-FIGURES = (  # with the panels of each
-    ("groups.png", "Residual by device, receiver and flight",
-     "Median of the held-out residual of the base (measured minus predicted; red: less was "
-     f"measured) and its scatter.{FRAMED}", ()),
-    ("level_map.png", "Levels on the map",
-     "Measured level, level predicted while the link was held out, and their difference, at the "
-     "position of the moving end.", ("measured", "predicted", "difference")),
-    ("drivers.png", "Dependence of the residual",
-     "Mean held-out residual over the variables that it depends on most, with one standard error."
-     f"{CONTRIBUTION} The diffraction parameter (ν of ITU-R P.526) says how far the map reaches "
-     "into the straight line: above 0 it blocks it.", ()),
-)
 GROUPS = {"los": "with line of sight", "nlos": "without line of sight"}
 COLUMNS = {"n": "links", "bias_db": "bias [dB]", "std_db": "standard deviation [dB]",
            "correlation": "correlation", "rmse_db": "RMSE [dB]", "mae_db": "MAE [dB]",
            "nll": "−log-likelihood [nats]"}
 LEARNT = {"combined": "all that was learnt together",
           "map": "its map: mean level at a receiver without faults"}
-UNITS = {"deg": "°"}  # where a page does not write them as the file does
 MAX_ROWS = 40  # groups with more members are left out of the tables
 MAX_COLUMNS = 30  # of the scores
 MAX_MODELS = 100
@@ -89,17 +66,10 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
         BadInput: a damaged figure.
     """
     candidates, (lead, *more) = report["candidates"], words.summary(report)
-    is_changed = words.has_additions(report)
-    is_marked = any(each.get("places") for each in words.found_causes(report)) or any(
-        each["members"].get("device") for each in report["anomalies"])
-    is_drawn = {MARKED: is_marked, FRAMED: bool(report["anomalies"]), CONTRIBUTION: is_changed}
-    map_picture, *pictures = [
-        read_picture(folder, name, title, _only_drawn(text, is_drawn), panels) for
-        name, title, text, panels in ((*MAP, ("before", "after") if is_changed else ()), *FIGURES)]
+    map_picture, steps, *pictures = _pictures(report, folder)
     return {
         "lead": lead, "more": more, "rivals": words.rivals(report), "cards": _cards(report),
-        "map": map_picture,
-        "steps": read_picture(folder, *STEPS),
+        "map": map_picture, "steps": steps,
         "anomalies": Table(anomaly_words.COLUMNS, anomaly_words.rows(report), "", 3),
         "figures": [picture for picture in pictures if picture],
         "effects": [_effect(each, folder) for each in report["effects"][:MAX_EFFECTS]],
@@ -124,11 +94,37 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
         "notes": report["notes"]}
 
 
-def _only_drawn(caption: str, is_drawn: dict[str, bool]) -> str:
-    """Return a caption without the sentences whose value in `is_drawn` is false."""
-    for sentence in (each for each, is_there in is_drawn.items() if not is_there):
-        caption = caption.replace(sentence, "")
-    return caption
+def _pictures(report: dict, folder: Path) -> list[Picture | None]:
+    """Read the figures of a page: map, steps, groups, levels, dependence; their captions."""
+    is_marked = any(each.get("places") for each in words.found_causes(report)) or any(
+        each["members"].get("device") for each in report["anomalies"])
+    marked = " Purple: what was found." if is_marked else ""
+    framed = contribution = ""
+    panels: tuple[str, ...] = ()
+    if report["anomalies"]:
+        framed = " Framed: groups that stand out; dashed: part of their links."
+    if words.has_additions(report):
+        contribution = " Dashed: contribution of the effects to the prediction."
+        panels = ("before", "after")
+    return [
+        read_picture(folder, "residual_map.png", "Residual on the map",
+                     "Measured − predicted level on held-out links, at the position of the moving "
+                     f"end; red: less was measured than predicted.{marked}", panels),
+        read_picture(folder, "waterfall.png", "Error step by step",
+                     "RMSE on held-out links, which were used neither to choose nor to fit the "
+                     "model: the base alone, the change by each effect, and the result. Horizontal "
+                     "lines: other models, held out in the same way, unless they are far worse."),
+        read_picture(folder, "groups.png", "Residual by device, receiver and flight",
+                     "Median of the held-out residual of the base (measured minus predicted; red: "
+                     f"less was measured) and its scatter.{framed}"),
+        read_picture(folder, "level_map.png", "Levels on the map",
+                     "Measured level, level predicted while the link was held out, and their "
+                     "difference, at the position of the moving end.",
+                     ("measured", "predicted", "difference")),
+        read_picture(folder, "drivers.png", "Dependence of the residual",
+                     "Mean held-out residual over the variables that it depends on most, with one "
+                     f"standard error.{contribution} The diffraction parameter (ν of ITU-R P.526) "
+                     "says how far the map reaches into the straight line: above 0 it blocks it.")]
 
 
 def _cards(report: dict) -> list[tuple[str, str]]:
@@ -160,8 +156,8 @@ def _effect(effect: dict, folder: Path) -> dict[str, Any]:
     kind = ("interpolated, not explained" if name in interpolations() else
             "part of the base" if effect.get("is_declared") else "")
     has_panels = any(each.figure == "links" for each in effects_named(name))
-    rows = [[parameter_label(key, labels), _value(p), _interval(p), UNITS.get(p["unit"], p["unit"])]
-            for key, p in effect["parameters"].items()]
+    rows = [[parameter_label(key, labels), _value(p), _interval(p),
+             "°" if p["unit"] == "deg" else p["unit"]] for key, p in effect["parameters"].items()]
     return {"rank": effect["rank"], "label": label, "kind": kind, "evidence": _evidence(effect),
             "picture": read_picture(folder, effect_picture(effect["rank"], name), label, "",
                                     ("without it", "with it") if has_panels else ()),

@@ -140,33 +140,36 @@ def is_sure(report: dict) -> bool:
 
 
 def rivals(report: dict) -> str:
-    """Say how probable each found cause is, and what else the first of them may be.
-
-    What the first cause leaves of the probability is divided among the other hypotheses of its step
-    of the search, in proportion to theirs.
-    """
-    explaining = found_causes(report)
-    known = [each for each in explaining if each.get("probability") is not None]
-    found = [f"{name_label(each['name'])} {probability(each['probability'])}" for each in known]
-    text = f"Probability that it is there: {join_names(found)}. " if found else ""
-    first = next((rank for rank, each in enumerate(report["effects"], 1)
-                  if each in explaining), 0)
-    # What acts on one flight comes before the steps of which rivals are known.
-    step = next((each for each in report["posterior"] if each["step"] == first), None)
-    if step is None or report["effects"][first - 1].get("probability") is None:
+    """Say how probable each found cause is, and what else the first of them may be."""
+    causes = found_causes(report)
+    known = [f"{name_label(each['name'])} {probability(each['probability'])}" for each in causes
+             if each.get("probability") is not None]
+    text = f"Probability that it is there: {join_names(known)}. " if known else ""
+    if not causes or causes[0].get("probability") is None:
         return text
+    rank = report["effects"].index(causes[0]) + 1
+    # What acts on one flight comes before the steps of which rivals are known.
+    step = next((each for each in report["posterior"] if each["step"] == rank), None)
+    likely = [] if step is None else _rivals_of(causes[0], step, report)
+    return text + (f"What else it may be: {join_names(likely[:MAX_NAMED])}." if likely else "")
+
+
+def _rivals_of(cause: dict, step: dict, report: dict) -> list[str]:
+    """List what else a cause may be that was found at a step, with probabilities.
+
+    What the cause leaves of the probability is divided among the other hypotheses of the step, in
+    proportion to theirs.
+    """
     named = {each["name"] for each in report["effects"]}
     others = {each["name"]: each["probability"] or 0.0 for each in step["probabilities"]
               if each["name"] not in named
               and not (each["name"] == NONE and report.get("anomalies"))}
-    left = 1.0 - report["effects"][first - 1]["probability"]
-    share = min(1.0, left / max(sum(others.values()), 1e-9))
-    same = report["effects"][first - 1].get("indistinguishable_from", [])
+    share = min(1.0, (1.0 - cause["probability"]) / max(sum(others.values()), 1e-9))
+    same = cause.get("indistinguishable_from", [])
     # A number would say that the data can tell them apart.
-    likely = [f"{name_label(name)} (the data cannot tell them apart)" for name in same]
-    likely += [f"{_hypothesis_label(name)} {probability(share * each)}"
-               for name, each in others.items() if share * each >= LIKELY and name not in same]
-    return text + (f"What else it may be: {join_names(likely[:MAX_NAMED])}." if likely else "")
+    return [*(f"{name_label(name)} (the data cannot tell them apart)" for name in same),
+            *(f"{_hypothesis_label(name)} {probability(share * each)}"
+              for name, each in others.items() if share * each >= LIKELY and name not in same)]
 
 
 def undetectable(report: dict) -> str:

@@ -26,14 +26,14 @@ class Pivot:
     """Table of residuals by two ends, such as device and flight.
 
     Attributes:
-        ends: of rows and columns, such as `device` and `flight`.
+        axes: what the rows and the columns are, such as `device` and `flight`.
         names: of rows and of columns.
         median_db: (rows, columns) [dB]; NaN where there are few links.
         scatter_db: (rows, columns) standard deviation, robust [dB].
         left_out: members that are not shown, by end.
     """
 
-    ends: tuple[str, str]
+    axes: tuple[str, str]
     names: tuple[list[str], list[str]]
     median_db: np.ndarray
     scatter_db: np.ndarray
@@ -131,8 +131,8 @@ def _label(ax: Axes, found: Pivot, column: int) -> None:
                   fontsize=8)
     more = {end: f"{end}{'s' * (count != 1)}" for end, count in found.left_out.items()}
     left = [f"{count} {more[end]} not shown" for end, count in found.left_out.items() if count]
-    ax.set_xlabel("; ".join([found.ends[1], *left]))
-    ax.set_ylabel(found.ends[0] if column == 0 else "")
+    ax.set_xlabel("; ".join([found.axes[1], *left]))
+    ax.set_ylabel(found.axes[0] if column == 0 else "")
     ax.tick_params(length=0)
     ax.spines[:].set_visible(False)
 
@@ -155,10 +155,10 @@ def _frame(ax: Axes, found: Pivot, members: dict[str, Sequence[str]], is_part: b
     The frame is dashed if the anomaly is only a part of the cells' links (`is_part`). Nothing is
     drawn if `members` names an end, such as receiver, that is not an axis of the panel.
     """
-    if not members or not set(members) <= set(found.ends):
+    if not members or not set(members) <= set(found.axes):
         return
     spans = []
-    for end, names in zip(found.ends, found.names, strict=True):
+    for end, names in zip(found.axes, found.names, strict=True):
         chosen = members.get(end)
         at = [place for place, name in enumerate(names) if chosen is None or name in chosen]
         spans.append(_consecutive(at))

@@ -139,18 +139,13 @@ def number(value: float | None) -> str:
     return "0.00" if text == "-0.00" else text.replace("-", "−")
 
 
-def parameter_number(value: float | None) -> str:
-    """Return the number of a parameter; a small one keeps two digits, not 0.00."""
+def quantity(value: float | None, unit: str) -> str:
+    """Return the number of a parameter, a small one with two digits; times since 1970 are dates."""
+    if value is not None and unit == "s" and DATES_S[0] < value < DATES_S[1]:
+        return moment(value)
     if value is None or not 0 < abs(value) < 0.005:
         return number(value)
     return f"{value:.2g}".replace("-", "−")
-
-
-def quantity(value: float | None, unit: str) -> str:
-    """Return the number of a parameter; seconds since 1970 become a date."""
-    if value is not None and unit == "s" and DATES_S[0] < value < DATES_S[1]:
-        return moment(value)
-    return parameter_number(value)
 
 
 def two_digits(value: float) -> str:

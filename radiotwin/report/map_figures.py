@@ -390,7 +390,7 @@ def residual_map_figure(data: LoopData, background: MapBackground, report: dict)
     """
     panels = [(f"before: {name_label(data.base)}", data.before_db)]
     if data.changed:
-        names = [name_label(name) for name in data.kept]
+        names = [name_label(name) for name in data.added]
         added = join_names(names) if len(names) < 3 else f"{len(names)} effects"
         panels.append((f"after: with {added}", data.after_db))
     residuals_db = [data.links.level_db - predicted_db for _, predicted_db in panels]

@@ -136,7 +136,7 @@ def test_walls_that_are_off_are_no_cause_but_part_of_the_base(small_scene, tmp_p
     assert [each.name for each in loop.before.whole.effects] == ["uncertain_sight"]
     report = make_report(loop)
     assert report["verdict"] != "effect" and report["effects"][0]["is_declared"]
-    assert "uncertain_sight" not in collect(loop).kept
+    assert "uncertain_sight" not in collect(loop).added
     corrected_twin(loop, small_scene).save(tmp_path / "twin")
     twin = Twin.load(tmp_path / "twin")
     assert [each.name for each in twin.fitted.effects] == ["uncertain_sight"]

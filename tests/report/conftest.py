@@ -47,25 +47,40 @@ def browser():
 
 
 @pytest.fixture
-def opened(browser):
-    """`opened(path)` is the page of a file, once the picture stands; it must not complain or fetch anything."""
-    pages, wrong = [], []
+def opened_raw(browser):
+    """`opened_raw(path)` is the page of a file, and what it complained of or asked for."""
+    pages = []
 
     def open_page(path):
-        page = browser.new_page(viewport={"width": 720, "height": 560})
+        page, wrong = browser.new_page(viewport={"width": 720, "height": 560}), []
         page.on("console", lambda message: wrong.append(message.text) if message.type in ("error", "warning") else None)
         page.on("pageerror", lambda error: wrong.append(str(error)))
-        page.on("request", lambda request: wrong.append(request.url) if request.url != path.as_uri() else None)
+        page.on("request", lambda request: wrong.append(request.url[:200]) if request.url != path.as_uri()
+                and not request.url.startswith("data:image/png") else None)
+        page.on("dialog", lambda dialog: wrong.append(dialog.message))
         page.set_default_timeout(120_000)  # machines that run tests may be busy
         pages.append(page)
         page.goto(path.as_uri())
-        page.wait_for_selector("body[data-ready-ms]")
-        return page
+        return page, wrong
 
     yield open_page
     for page in pages:
         page.close()
-    assert wrong == []
+
+
+@pytest.fixture
+def opened(opened_raw):
+    """`opened(path)` is the page of a file, once the picture stands; it must not complain or fetch anything."""
+    every = []
+
+    def open_page(path):
+        page, wrong = opened_raw(path)
+        every.append(wrong)
+        page.wait_for_selector("body[data-ready-ms]")
+        return page
+
+    yield open_page
+    assert not any(every)
 
 
 @pytest.fixture(scope="session")

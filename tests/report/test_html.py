@@ -122,28 +122,6 @@ def used(page):
     return page.evaluate("window.pwned ?? null")
 
 
-@pytest.fixture
-def opened_raw(browser):
-    """`opened_raw(path)` is a page, and what it complained of or asked for."""
-    pages = []
-
-    def open_page(path):
-        page, wrong = browser.new_page(viewport={"width": 720, "height": 560}), []
-        page.on("console", lambda message: wrong.append(message.text) if message.type in ("error", "warning") else None)
-        page.on("pageerror", lambda error: wrong.append(str(error)))
-        page.on("request", lambda request: wrong.append(request.url[:200]) if request.url != path.as_uri()
-                and not request.url.startswith("data:image/png") else None)
-        page.on("dialog", lambda dialog: wrong.append(dialog.message))
-        page.set_default_timeout(120_000)
-        pages.append(page)
-        page.goto(path.as_uri())
-        return page, wrong
-
-    yield open_page
-    for page in pages:
-        page.close()
-
-
 @pytest.mark.parametrize("with_policy", [True, False], ids=["with policy", "by escaping alone"])
 @pytest.mark.parametrize("name", ["report.html", "closeloop.html"])
 def test_nothing_of_a_hostile_run_runs(hostile, opened_raw, server, tmp_path, name, with_policy):
