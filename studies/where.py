@@ -68,7 +68,7 @@ def say_where(seed: int, settings: dict) -> dict:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         model = base_of(measurements, scene, seed)
-        anomalies = scan(model)
+        anomalies = scan(Readings.of(model))
     return compare(model, anomalies, measurements, effects, changes_db, true_los)
 
 

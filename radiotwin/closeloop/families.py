@@ -395,12 +395,7 @@ def _square_family(link: np.ndarray, cell: np.ndarray, width_m: float,
                    ends: tuple[np.ndarray, ...], units: Units) -> Family:
     """Return a family with one group for each square of ground: the links in it, or across it.
 
-    Args:
-        link: (m,) a link that is in a square; pairs of link and square may repeat.
-        cell: (m, 2) indices of that square.
-        width_m: side of the squares [m].
-        ends: labels whose mean levels are subtracted, see `Family.ends`.
-        units: labels of readings with correlated errors.
+    `link` (m,) and `cell` (m, 2) are pairs of a link and a square that it is in; they may repeat.
     """
     least = cell.min(axis=0)
     columns = np.int64(np.ptp(cell[:, 1]) + 1)

@@ -27,6 +27,7 @@ from radiotwin.closeloop.crossfit import (
     paths_gain_db,
     training_parts,
 )
+from radiotwin.closeloop.families import Readings
 from radiotwin.closeloop.predict.predictor import CombinedPrediction, combined_prediction
 from radiotwin.closeloop.scan import scan
 from radiotwin.closeloop.scan_sensitivity import LeastDeviation, least_deviations
@@ -256,7 +257,7 @@ def close_loop(measurements: Measurements | pd.DataFrame | Path | str,
                           executor or Executor(), on_progress)
     declared = search(SearchState(model), [add_declared], inputs)
     on_progress(BASE_FITTED)
-    declared = replace(declared, anomalies=tuple(scan(declared.model)))
+    declared = replace(declared, anomalies=tuple(scan(Readings.of(declared.model))))
     before = after = dependences(declared.model, seed)
     found = search(declared, [add_causes_of_anomalies, add_faults, add_changes, add_causes,
                               drop_idle_faults], inputs)

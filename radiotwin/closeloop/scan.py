@@ -16,7 +16,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.special import expit, logit
 
-from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.closeloop.families import Family, Readings, combined_labels, families_of, units_of
 from radiotwin.closeloop.verdict.criteria import MIN_SURE
 from radiotwin.effects.params import QUANTILE_90, Parameter
@@ -133,23 +132,12 @@ class _Found:
         return float(self.compared.distance.size[self.group])
 
 
-def scan(model: CrossFit) -> list[Anomaly]:
-    """Find groups of links whose held-out residuals stand out, the most evident first.
+def scan(readings: Readings) -> list[Anomaly]:
+    """Find groups of readings whose held-out residuals stand out, the most evident first.
 
-    Args:
-        model: cross-validated fit of n links.
-
-    Returns:
-        groups with a probability over `MIN_PROBABILITY`, at most `MAX_ANOMALIES`.
-    """
-    return scan_readings(Readings.of(model))
-
-
-def scan_readings(readings: Readings) -> list[Anomaly]:
-    """Find groups of readings that stand out from their peers, see `scan`.
-
-    One group is taken at a time: the one without whose deviation least remains unexplained. Its
-    deviation is subtracted from the residuals before the next round.
+    They have a probability over `MIN_PROBABILITY` and are at most `MAX_ANOMALIES`. One group is
+    taken at a time: the one without whose deviation least remains unexplained. Its deviation is
+    subtracted from the residuals before the next round.
     """
     units = units_of(readings)
     families = list(families_of(readings, units))
@@ -373,12 +361,9 @@ def _candidates(compared: list[Compared], first: list[Compared],
                 taken: list[_Found]) -> list[_Found]:
     """Return the most probable group of each family, at most `MAX_RIVALS`, most probable first.
 
-    Args:
-        compared: comparison of the residuals after the groups in `taken` were subtracted.
-        first: comparison before any group was taken.
-        taken: groups found so far, which are excluded. Also excluded is a group that did not stand
-            out in `first` and deviates by less than `ECHO` of the first group found: it may be
-            what the subtraction of that group left over.
+    Excluded are groups that were `taken`, and one that did not stand out in the `first` comparison
+    and deviates by less than `ECHO` of the first group found: it may be what the subtraction of
+    that group left over.
     """
     found, before = [], {table.key: table.log_odds for table in first}
     for table in compared:

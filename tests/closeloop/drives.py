@@ -7,10 +7,9 @@ No code of radiotwin makes their levels: laws, antennas and errors are written o
 import numpy as np
 import pandas as pd
 
-from radiotwin.closeloop.crossfit import cross_validate, make_bases, make_folds
-from radiotwin.links import prepare_links
 from radiotwin.links.measurements import Measurements
 from radiotwin.twin.model.fitting import add_effect
+from tests.closeloop.looking import based
 
 FLIGHTS, POINTS, STEP_M = 8, 90, 12.0
 MASTS_M = np.array([[170.0, 280.0, 25.0], [360.0, 140.0, 30.0], [380.0, 400.0, 20.0]])
@@ -51,13 +50,11 @@ def drive(seed, sd_db=3.0, length_m=40.0, noise_db=1.0, span_deg=360.0):
     return table
 
 
-def fitted(table, effect, seed=0, devices_m=MASTS_M):
+def fitted(table, effect, devices_m=MASTS_M):
     """Return the base log-distance with one effect: of all links, and of those outside each fold."""
     devices = pd.DataFrame({"device": [f"d{i}" for i in range(len(devices_m))], "x_m": devices_m[:, 0],
                             "y_m": devices_m[:, 1], "z_m": devices_m[:, 2], "role": "anchor", "frequency_hz": 2.4e9})
     measurements = Measurements(table.drop(columns=["azimuth_deg", "distance_m"]), devices)
-    links = prepare_links(measurements, None)
-    folds = make_folds(links, seed)
-    before = cross_validate(links, make_bases(None, seed)["log-distance"], folds)
+    before, _ = based(measurements)
     whole = add_effect(before.whole, effect)
     return before.with_fits(whole, [add_effect(fold, effect, whole.effects[-1]) or fold for fold in before.folds])

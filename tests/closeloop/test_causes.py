@@ -6,11 +6,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from radiotwin.closeloop.crossfit import (
-    LogDistanceBase,
-    cross_validate,
-    make_folds,
-)
 from radiotwin.closeloop.run import close_loop
 from radiotwin.closeloop.search import causes
 from radiotwin.closeloop.search.causes import Tried, add_causes, forward_selection
@@ -23,7 +18,7 @@ from radiotwin.effects.catalogue.detection_limit import DetectionLimit
 from radiotwin.effects.catalogue.excess_attenuation import ExcessAttenuation
 from radiotwin.effects.catalogue.gain_drift import ReceiverDrift
 from radiotwin.effects.catalogue.gain_offsets import DeviceGainOffset, ReceiverGainOffset
-from radiotwin.links import prepare_links
+from tests.closeloop.looking import based
 
 INPUTS = SearchInputs(None, None, None, ())
 
@@ -41,11 +36,9 @@ def test_an_offset_that_no_fold_has_links_enough_for_is_not_kept(open_ground):
 
 
 def test_a_candidate_that_no_held_out_link_can_judge_is_refused(open_ground):
-    links = prepare_links(open_ground.measured(open_ground.fly(0)), None)
-    folds = make_folds(links, 0)
-    model = cross_validate(links, LogDistanceBase(None, 0), folds)
+    model, _ = based(open_ground.measured(open_ground.fly(0)))
     extended = model.with_fits(model.whole, model.folds)
-    extended.held_out_nll = np.full(len(links), np.nan)
+    extended.held_out_nll = np.full(len(model.links), np.nan)
     score = score_model(model, extended, Trial("device_gain_offset"), INPUTS.criteria)
     assert "no held-out link" in score.reason
 
@@ -54,10 +47,8 @@ def with_a_loud_receiver(open_ground, *effects):
     """Search lasting causes where one receiver reads 6 dB too much."""
     world = open_ground.fly(3)
     world.gain_db[world.receiver == 1] += 6.0
-    links = prepare_links(open_ground.measured(world), None)
-    folds, base = make_folds(links, 0), LogDistanceBase(None, 0)
-    model = cross_validate(links, base, folds)
-    return search(SearchState(model), [add_causes], SearchInputs(links, base, folds, effects))
+    model, inputs = based(open_ground.measured(world), *effects)
+    return search(SearchState(model), [add_causes], inputs)
 
 
 def test_weaker_candidates_are_scored_if_the_best_one_is_improbable(open_ground, monkeypatch):
@@ -153,23 +144,3 @@ def test_without_a_candidate_there_is_no_step():
     """What is left may depend on variables that have no order, such as flights, of which no curve can be tried."""
     state = SearchState(MODEL, TrialLog().record(Trial("foliage", kept=True, rivals=("interference",))))
     assert forward_selection(state, [], INPUTS) is state
-
-
-def test_what_gains_nothing_is_no_part_of_the_base_either(open_ground):
-    """No fold proposes it, so folds are as they were; nothing is claimed, and nothing is needed but a gain."""
-    links = prepare_links(open_ground.measured(open_ground.fly(0)), None)
-    folds = make_folds(links, 0)
-    model = cross_validate(links, LogDistanceBase(None, 0), folds)
-    same = model.with_fits(model.whole, model.folds)
-    score = score_model(model, same, Trial("roof_heights"), INPUTS.criteria)
-    assert score.nll_gain == 0 and not score.passed and "gains too little" in score.reason
-
-
-def test_of_two_effects_of_one_name_the_one_that_is_probable_beside_another_is_kept(monkeypatch):
-    monkeypatch.setattr(causes, "_refit_exactly", lambda model: model)
-    sector, dipole = (Tried(variant, Trial("antenna_pattern", variant=variant, passed=True), None)
-                      for variant in ("", "dipole"))
-    other = Tried("grove", Trial("foliage", passed=True), None)
-    log = causes._keep_together(SearchState(MODEL), [sector, dipole], [dipole, other]).log
-    assert [(each.name, each.variant, each.kept) for each in log.trials] == [
-        ("antenna_pattern", "", False), ("antenna_pattern", "dipole", True), ("foliage", "", True)]

@@ -52,6 +52,13 @@ def loop_of(scene, *found):
     return SimpleNamespace(after=SimpleNamespace(whole=SimpleNamespace(effects=effects, links=links)))
 
 
+def corrected(folder, scene, *found, name=None):
+    """Return what is told of a scene that is written as a loop found it, and that scene; `name`: of its first device."""
+    loop = loop_of(scene, *found)
+    loop.after.whole.links.device_names[:1] = [name or loop.after.whole.links.device_names[0]]
+    return write_corrected_scene(loop, scene, folder), Scene.load(folder)
+
+
 def ends(x_m, y_m, turn_deg, reach_m, z_m):
     """Return two points on both sides of a position, along a direction."""
     turn = np.radians(turn_deg)
@@ -67,28 +74,26 @@ def tallest(scene):
 
 def test_a_traced_box_is_in_the_way_as_long_wide_and_turned_as_it_was_found(small_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(corrected_scene, "draw_preview", draw_preview)
-    loop = loop_of(small_scene, (MissingObstacle, {"box": BOX, "scattered_db": 0.0}))
-    changes = write_corrected_scene(loop, small_scene, tmp_path / "new")
+    changes, again = corrected(tmp_path / "new", small_scene, (MissingObstacle, {"box": BOX, "scattered_db": 0.0}))
     assert (tmp_path / "new" / "preview.png").stat().st_size > 10_000
     assert changes == ["a box of 24 x 14 m, 70 m high, stands at (130, 45) m"]
-    city = Scene.load(tmp_path / "new").city
+    city = again.city
     for turn_deg, half_m in ((30.0, 12.0), (120.0, 7.0)):  # along it and across
         a_m, b_m = ends(*BOX[:2], turn_deg, 40.0, 60.0)
         assert small_scene.city.line_of_sight(a_m, b_m)[0] and not city.line_of_sight(a_m, b_m)[0]
         assert city.metres_inside(a_m, b_m)[0] == pytest.approx(2 * half_m, abs=0.01)
     a_m, b_m = ends(*BOX[:2], 30.0, 40.0, 71.0)
     assert city.line_of_sight(a_m, b_m)[0]
-    again = Scene.load(tmp_path / "new").config
-    assert again.provenance.pop("corrected") == changes[0]
-    assert again == small_scene.config
+    assert again.config.provenance.pop("corrected") == changes[0]
+    assert again.config == small_scene.config
 
 
 def test_a_building_that_is_gone_lets_links_through_and_others_do_not(small_scene, tmp_path):
     building, x_m, y_m, height_m = tallest(small_scene)
-    loop = loop_of(small_scene, (RemovedObstacle, {"building": building, "centre_m": [x_m, y_m, height_m]}))
-    changes = write_corrected_scene(loop, small_scene, tmp_path / "new")
-    assert len(changes) == 1 and "is taken out" in changes[0]
-    city = Scene.load(tmp_path / "new").city
+    (change,), new = corrected(tmp_path / "new", small_scene,
+                               (RemovedObstacle, {"building": building, "centre_m": [x_m, y_m, height_m]}))
+    assert "is taken out" in change
+    city = new.city
     above, below = np.array([[x_m, y_m, height_m + 1]]), np.array([[x_m, y_m, 0.5]])
     assert not small_scene.city.line_of_sight(above, below)[0] and city.line_of_sight(above, below)[0]
     assert len(buildings(city)[1]) == len(buildings(small_scene.city)[1]) - 1
@@ -112,17 +117,15 @@ def test_roofs_that_are_off_are_raised_and_lowered_and_the_table_follows(tmp_pat
     roofs = tuple(Roof(by_height[height_m], *centres_m[by_height[height_m]].tolist(), offset_m, 0.6)
                   for height_m, offset_m in ((12, 3.0), (9, -4.0)))
     gone = {"building": by_height[20], "centre_m": centres_m[by_height[20]].tolist()}
-    loop = loop_of(scene, (RoofHeights, {"roofs": roofs}), (RemovedObstacle, gone))
-    changes = write_corrected_scene(loop, scene, tmp_path / "new")
+    changes, new = corrected(tmp_path / "new", scene, (RoofHeights, {"roofs": roofs}), (RemovedObstacle, gone))
     assert any("is 15.0 m high, and 12.0 m on the map" in change for change in changes)
-    corrected = Scene.load(tmp_path / "new")
     for each in roofs:
-        assert corrected.city.height_at(each.x_m, each.y_m) == pytest.approx(each.height_m + each.offset_m, abs=1e-3)
-    assert sorted(np.round(buildings(corrected.city)[1][:, 2], 3)[-2:]) == [5.0, 15.0]  # walls, too
+        assert new.city.height_at(each.x_m, each.y_m) == pytest.approx(each.height_m + each.offset_m, abs=1e-3)
+    assert sorted(np.round(buildings(new.city)[1][:, 2], 3)[-2:]) == [5.0, 15.0]  # walls, too
     table = pd.read_csv(tmp_path / "new" / "buildings.csv")
     assert sorted(zip(table["top_m"], table["height_from"], table["height_sd_m"])) == [
         (5.0, "close-loop", 0.6), (15.0, "close-loop", 0.6)]
-    told_m = corrected.city.height_sd_m
+    told_m = new.city.height_sd_m
     assert set(told_m[np.isfinite(told_m)]) == {0.6}
 
 
@@ -152,18 +155,17 @@ def test_one_building_of_a_mesh_that_holds_several(small_scene, tmp_path):
     write_city(tmp_path / "one", [CityShape("all", mesh, itu_material("concrete"))])
     scene = Scene.load(tmp_path / "one")
     building, x_m, y_m, height_m = tallest(scene)
-    write_corrected_scene(loop_of(scene, (RemovedObstacle, {"building": building, "centre_m": (x_m, y_m, height_m)})), scene, tmp_path / "new")
-    new = buildings(Scene.load(tmp_path / "new").city)[1]
+    _, one = corrected(tmp_path / "new", scene, (RemovedObstacle, {"building": building, "centre_m": (x_m, y_m, height_m)}))
+    new = buildings(one.city)[1]
     old = np.delete(buildings(scene.city)[1], building, axis=0)
     assert np.sort(new, axis=0) == pytest.approx(np.sort(old, axis=0))
 
 
 def test_an_anchor_is_where_it_was_found(small_scene, tmp_path):
-    loop = loop_of(small_scene, (DevicePositionError, {"device": 0, "move_m": [0.0, 20.0]}),
-                   (DevicePositionError, {"device": 0, "move_m": [5.0, 0.0]}),
-                   (ReceiverDrift, {"receivers": {0: ("step", 150.0)}}))
-    assert write_corrected_scene(loop, small_scene, tmp_path / "new") == ["d0 is moved from (80, 40) to (85, 60) m"]
-    new = Scene.load(tmp_path / "new")
+    told, new = corrected(tmp_path / "new", small_scene, (DevicePositionError, {"device": 0, "move_m": [0.0, 20.0]}),
+                          (DevicePositionError, {"device": 0, "move_m": [5.0, 0.0]}),
+                          (ReceiverDrift, {"receivers": {0: ("step", 150.0)}}))
+    assert told == ["d0 is moved from (80, 40) to (85, 60) m"]
     assert new.device_m[0] == pytest.approx(small_scene.device_m[0] + (5, 20, 0))
     assert (new.device_m[1:] == small_scene.device_m[1:]).all()
     assert new.xml_path.read_bytes() == small_scene.xml_path.read_bytes()
@@ -187,10 +189,9 @@ def rays(azimuth_deg, elevation_deg):
 
 def test_an_antenna_that_was_found_is_declared(small_scene, tmp_path):
     name = small_scene.config.devices[0].device
-    changes = write_corrected_scene(loop_of(small_scene, (SectorAntenna, {"devices": {0: SECTOR}})), small_scene,
-                                    tmp_path / "new")
+    changes, new = corrected(tmp_path / "new", small_scene, (SectorAntenna, {"devices": {0: SECTOR}}))
     assert changes == [f"{name} has a sector antenna that looks to 205° and is 60° wide"]
-    antenna, *others = Scene.load(tmp_path / "new").device_antennas
+    antenna, *others = new.device_antennas
     assert others == [None] * len(others)
     azimuth, elevation = np.meshgrid(np.arange(0, 360, 10.0), np.arange(-88.0, 89.0, 4.0))
     gain_dbi = antenna.gain_dbi(rays(azimuth, elevation))
@@ -198,9 +199,8 @@ def test_an_antenna_that_was_found_is_declared(small_scene, tmp_path):
     np.testing.assert_allclose(gain_dbi - peak_dbi, sector_dbi(azimuth, elevation), atol=0.15)
     weight = np.cos(np.radians(elevation))
     assert 10 * np.log10((weight * 10 ** (gain_dbi / 10)).sum() / weight.sum()) == pytest.approx(0, abs=0.1)
-    again = write_corrected_scene(loop_of(small_scene, (SectorAntenna, {"devices": {1: SECTOR}})), small_scene,
-                                  tmp_path / "new")
-    assert len(again) == 1 and Scene.load(tmp_path / "new").device_antennas[0] is None
+    again, other = corrected(tmp_path / "new", small_scene, (SectorAntenna, {"devices": {1: SECTOR}}))
+    assert len(again) == 1 and other.device_antennas[0] is None
 
 
 def test_devices_whose_names_differ_in_a_dot_have_antennas_of_their_own(small_scene, tmp_path):
@@ -214,11 +214,9 @@ def test_devices_whose_names_differ_in_a_dot_have_antennas_of_their_own(small_sc
 
 @pytest.mark.parametrize("name", ["LTE 262-1-5-7", "BS@1", "02:1b:44:11:3a:b7"])
 def test_an_anchor_that_no_scene_can_name_is_left_out_and_told(small_scene, tmp_path, name):
-    loop = loop_of(small_scene, (SectorAntenna, {"devices": {0: SECTOR}}))
-    loop.after.whole.links.device_names = [name]
-    [change] = write_corrected_scene(loop, small_scene, tmp_path / "new")
+    [change], new = corrected(tmp_path / "new", small_scene, (SectorAntenna, {"devices": {0: SECTOR}}), name=name)
     assert change.startswith(f"{name!r} has a sector antenna, and is not in the scene")
-    assert len(Scene.load(tmp_path / "new").config.devices) == len(small_scene.config.devices)
+    assert len(new.config.devices) == len(small_scene.config.devices)
 
 
 def test_an_anchor_that_the_scene_lacks_is_declared_with_its_antenna(small_scene, tmp_path):
@@ -248,12 +246,9 @@ def test_positions_that_cannot_be_are_moved_to_the_nearest_that_can(small_scene,
 
 
 def test_what_was_corrected_can_be_corrected_again(small_scene, tmp_path):
-    write_corrected_scene(loop_of(small_scene, (MissingObstacle, {"box": BOX, "scattered_db": 0.0})),
-                          small_scene, tmp_path / "a")
-    scene = Scene.load(tmp_path / "a")
+    _, scene = corrected(tmp_path / "a", small_scene, (MissingObstacle, {"box": BOX, "scattered_db": 0.0}))
     other = [110.0, 100.0, 10.0, 10.0, 50.0, 0.0]
-    write_corrected_scene(loop_of(scene, (MissingObstacle, {"box": other, "scattered_db": 0.0})), scene, tmp_path / "b")
-    again = Scene.load(tmp_path / "b")
+    _, again = corrected(tmp_path / "b", scene, (MissingObstacle, {"box": other, "scattered_db": 0.0}))
     assert again.city.height_at([110.0, 130.0], [100.0, 45.0]) == pytest.approx([50.0, 70.0])
     assert again.config.provenance["corrected"].count("a box of") == 2
 
@@ -288,10 +283,8 @@ def test_sionna_rt_traces_it(small_scene, tmp_path):
     building that blocked it is taken out.
     """
     building, x_m, y_m, height_m = tallest(small_scene)
-    loop = loop_of(small_scene, (MissingObstacle, {"box": BOX, "scattered_db": 0.0}),
-                   (RemovedObstacle, {"building": building, "centre_m": (x_m, y_m, height_m)}))
-    write_corrected_scene(loop, small_scene, tmp_path / "new")
-    new = Scene.load(tmp_path / "new")
+    _, new = corrected(tmp_path / "new", small_scene, (MissingObstacle, {"box": BOX, "scattered_db": 0.0}),
+                       (RemovedObstacle, {"building": building, "centre_m": (x_m, y_m, height_m)}))
     links = [*zip(*ends(*BOX[:2], 30.0, 40.0, 60.0)), *zip(*ends(x_m, y_m, 0.0, 60.0, 0.5 * height_m))]
     change_db = []
     for a_m, b_m in links:

@@ -12,11 +12,10 @@ import pandas as pd
 import pytest
 
 import radiotwin as rt
-from radiotwin.closeloop.crossfit import cross_validate, make_bases, make_folds
 from radiotwin.closeloop.output.corrected_twin import corrected_twin
 from radiotwin.closeloop.predict.baselines import EXTRA_TREES, grow_trees
 from radiotwin.closeloop.search.declared import add_declared
-from radiotwin.closeloop.search.stages import SearchInputs, SearchState, search
+from radiotwin.closeloop.search.stages import SearchState, search
 from radiotwin.effects.antennas import SectorPattern
 from radiotwin.effects.base import GainEffect
 from radiotwin.effects.catalogue.declared_sectors import DeclaredSectors
@@ -27,6 +26,7 @@ from radiotwin.links.variables import link_features
 from radiotwin.report.closeloop_figures import waterfall_figure
 from radiotwin.twin.model.blend import Blend
 from radiotwin.twin.model.uncertainty import estimates, linearise
+from tests.closeloop.looking import based
 
 MASTS_M = np.array([[150.0, 200.0, 25.0], [420.0, 330.0, 25.0]])
 AZIMUTHS_DEG = (20.0, 140.0, 260.0)
@@ -63,14 +63,11 @@ def network(seed, noise_db=3.0, points=400, tilts_deg=None):
 
 def taken(measurements):
     """Return the base log-distance, a device held out, with what is declared, the score and the notes."""
-    links = prepare_links(measurements, None)
-    folds = make_folds(links, 0, "device")
-    kind = make_bases(None, 0)["log-distance"]
-    base = cross_validate(links, kind, folds)
-    result = search(SearchState(base), [add_declared], SearchInputs(links, kind, folds, tuple(effect() for effect in BUILT_IN)))
+    base, inputs = based(measurements, *(effect() for effect in BUILT_IN), by="device")
+    result = search(SearchState(base), [add_declared], inputs)
     whole, parameters = result.model.whole, {}
     for each, estimate in zip(whole.effects, estimates(linearise(whole)), strict=True):
-        parameters |= each.parameters(links, estimate)
+        parameters |= each.parameters(inputs.links, estimate)
     return SimpleNamespace(before_db=base.rmse_db(), after_db=result.model.rmse_db(), scores=result.log.trials,
                            params=whole.effects[0].params if whole.effects else None, parameters=parameters,
                            variants=[each.variant for each in whole.effects],
@@ -106,14 +103,13 @@ def test_one_wrong_azimuth_is_named_among_right_ones(wrong, by_deg):
     if wrong is not None:
         azimuth_deg[wrong] += by_deg
     devices = measurements.devices.assign(azimuth_deg=azimuth_deg % 360)
-    links = prepare_links(replace(measurements, devices=devices), None)
-    kind, folds = make_bases(None, 0)["log-distance"], make_folds(links, 0, "block")
-    view = cross_validate(links, kind, folds).whole.view
+    model, inputs = based(replace(measurements, devices=devices), by="block")
+    view = model.whole.view
     (params,) = DeclaredSectors().propose(view)
     assert list(params.own_turns_deg) == ([] if wrong is None else [wrong])
     for turn_deg, sd_deg in params.own_turns_deg.values():
         assert abs(turn_deg + by_deg) < 12 and sd_deg < 12
-    said = DeclaredSectors().with_params(params).contradicted_declarations(links)
+    said = DeclaredSectors().with_params(params).contradicted_declarations(inputs.links)
     assert [NAMES[wrong] in each for each in said] == ([] if wrong is None else [True])
 
 
@@ -248,11 +244,8 @@ class All(Half):
 
 @pytest.mark.parametrize("forms", [(Half, All), (All, Half)])
 def test_of_two_forms_held_out_links_choose(forms):
-    links = prepare_links(network(5), None)
-    folds = make_folds(links, 0, "device")
-    kind = make_bases(None, 0)["log-distance"]
-    model = cross_validate(links, kind, folds)
-    result = search(SearchState(model), [add_declared], SearchInputs(links, kind, folds, tuple(form() for form in forms)))
+    model, inputs = based(network(5), *(form() for form in forms), by="device")
+    result = search(SearchState(model), [add_declared], inputs)
     [effect] = result.model.whole.effects
     assert effect.variant == "all of it"
     assert [each.reason for each in result.log.trials if not each.kept] == ["all of it gain more"]
@@ -278,11 +271,8 @@ def test_trees_of_a_stored_blend_know_the_azimuths_and_nobody_need_tell_them_aga
 @pytest.mark.slow
 def test_a_held_out_sector_is_predicted_as_the_twin_that_lacks_it_predicts_it():
     """Shadowing is scaled by the spread of heard sectors, however uncertain the level of an unheard one is."""
-    links = prepare_links(network(8), None)
-    folds = make_folds(links, 0, "device")
-    kind = make_bases(None, 0)["log-distance"]
-    inputs = SearchInputs(links, kind, folds, tuple(effect() for effect in BUILT_IN))
-    result = search(SearchState(cross_validate(links, kind, folds)), [add_declared], inputs)
+    base, inputs = based(network(8), *(effect() for effect in BUILT_IN), by="device")
+    result = search(SearchState(base), [add_declared], inputs)
     shadowing = [fit.fit_shadowing(0) for fit in result.model.fits]
     model = result.model.map(lambda fit, field: replace(fit, shadowing=field), shadowing)
     mean_db, scale_db = model.held_out_reading
@@ -292,7 +282,7 @@ def test_a_held_out_sector_is_predicted_as_the_twin_that_lacks_it_predicts_it():
     for number, (fold, field) in enumerate(zip(model.folds, shadowing[1:])):
         held_out = model.index == number
         assert len(np.unique(fold.links.device[held_out])) == 1
-        twin = replace(fold.learnt, shadowing=field).predict(links.select(held_out))
+        twin = replace(fold.learnt, shadowing=field).predict(inputs.links.select(held_out))
         np.testing.assert_allclose(mean_db[held_out], twin.mean_db, atol=1e-6)
         np.testing.assert_allclose(twin.sd_db, t_sd * scale_db[held_out], rtol=1e-6)
         assert (scale_db[held_out] > unheard_db[held_out]).all()

@@ -7,23 +7,17 @@ import pandas as pd
 import pytest
 
 import radiotwin as rt
-from radiotwin.closeloop.crossfit import (
-    CrossFit,
-    cross_validate,
-    make_bases,
-    make_folds,
-    match_effects,
-)
-from radiotwin.closeloop.search.faults import _without, drop_idle_faults
-from radiotwin.closeloop.search.stages import SearchInputs, SearchState
+from radiotwin.closeloop.crossfit import CrossFit, match_effects
+from radiotwin.closeloop.search.faults import drop_idle_faults
+from radiotwin.closeloop.search.stages import SearchState
 from radiotwin.closeloop.search.trials import Trial
 from radiotwin.effects.base import Term
 from radiotwin.effects.catalogue.episode import Episode
 from radiotwin.effects.catalogue.faulty_flight import FaultyFlight
 from radiotwin.effects.catalogue.gain_drift import Drift, ReceiverDrift
 from radiotwin.effects.params import Estimate
-from radiotwin.links import prepare_links
 from radiotwin.links.measurements import Measurements
+from tests.closeloop.looking import based
 from tests.worlds import leave_effects, shortened
 
 LOSS_DB, BEGIN_S, END_S = 9.0, 330.0, 365.0
@@ -129,6 +123,7 @@ def test_one_fault_is_not_another_where_a_fold_has_not_seen_the_first(effect):
     assert match_effects(whole, model_of(first, trend)) == [0, 1, None]
     assert match_effects(whole, model_of(on_links(effect, 40, 50))) == [None, None, None]
     assert match_effects(whole, model_of()) == [None, None, None]
+    assert match_effects(model_of(first), model_of(second)) == [0], "each has one of them"
 
 
 @pytest.mark.parametrize("effect", [FaultyFlight(), Episode()])
@@ -142,13 +137,10 @@ def test_two_of_a_kind_that_a_fold_found_in_another_order_are_not_swapped(effect
 
 @pytest.mark.parametrize("step_db", [0.0, 8.0])
 def test_a_step_that_other_effects_explain_is_taken_back(step_db):
-    links = prepare_links(campaign(4, loss_db=0.0, step_db=step_db), None)
-    folds = make_folds(links, 0, "flight")
-    base = make_bases(None, 0)["log-distance"]
-    model = cross_validate(links, base, folds)
+    model, inputs = based(campaign(4, loss_db=0.0, step_db=step_db), by="flight")
     step = ReceiverDrift(True).with_params(ReceiverDrift.Params(receivers={0: Drift("step", 600.0)}))
     found = SearchState(model).keep(Trial("receiver_drift"), model.map(lambda fit: fit.with_effects([step])))
-    result = drop_idle_faults(found, SearchInputs(links, base, folds, ()))
+    result = drop_idle_faults(found, inputs)
     stays = step_db > 0
     assert result.step == len(result.log.kept) == stays
     assert found.step == len(found.log.kept) == 1
@@ -161,31 +153,14 @@ def test_a_fault_that_its_own_search_would_not_find_beside_the_others_is_taken_b
     table = measurements.table
     lower = (table["receiver"] == "u0") & (always | table["time_s"].between(BEGIN_S, END_S))
     table.loc[lower, "gain_db"] -= 5.0
-    links = prepare_links(measurements, None)
-    folds = make_folds(links, 0, "flight")
-    base = make_bases(None, 0)["log-distance"]
-    model = cross_validate(links, base, folds)
+    model, inputs = based(measurements, by="flight")
     params = Episode.Params(receiver=0, flight=None, start_s=BEGIN_S, end_s=END_S, start_within_s=(BEGIN_S - 1, BEGIN_S),
                             end_within_s=(END_S, END_S + 1), form="loss", frequency_hz=2.4e9)
     episode = Episode().with_params(params)
-    inputs = SearchInputs(links, base, folds, ())
     found = SearchState(model).keep(Trial("episode"), model.map(lambda fit: fit.with_effects([episode])))
     assert model.whole.objective - found.model.whole.objective > inputs.criteria.min_training_gain_nats
     result = drop_idle_faults(found, inputs)
     assert result.step == len(result.log.kept) == (not always)
-
-
-def test_what_there_is_one_of_is_the_same_wherever_a_fold_finds_it():
-    effect = Episode()
-    assert match_effects(model_of(on_links(effect, 0, 10)), model_of(on_links(effect, 50, 60))) == [0]
-
-
-def test_only_the_fault_that_is_taken_back_leaves_a_fold():
-    effect = Episode()
-    first, second = on_links(effect, 10, 30), on_links(effect, 60, 80)
-    whole, fold = model_of(first, second), model_of(second)
-    assert _without(fold, match_effects(whole, fold)[0]).effects == [second[0]]
-    assert _without(fold, match_effects(whole, fold)[1]).effects == []
 
 
 def test_of_two_faults_each_is_unforeseen_where_its_flight_was_held_out():

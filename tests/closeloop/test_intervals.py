@@ -48,12 +48,6 @@ def offset_of_receivers(seed):
 
 
 @pytest.mark.slow
-def test_nine_in_ten_intervals_hold_with_errors_along_tracks():
-    """20 worlds: 90 % +- 2 * 6.7 %; intervals of independent links hold 30 %."""
-    assert 0.77 <= np.mean([offset_of_receivers(seed) for seed in range(20)]) <= 1.0
-
-
-@pytest.mark.slow
 def test_intervals_of_many_worlds_hold_eighty_to_ninety_seven_percent():
     held = [offset_of_receivers(seed) for seed in range(40)]
     for seed in range(24):
@@ -140,12 +134,12 @@ def test_a_parameter_that_most_folds_do_not_find_is_not_determined():
 
 @pytest.mark.parametrize(("low", "high", "allowed", "determined"), (
     (-100.0, 90.0, Allowed(period=360.0), False), (-40.0, 40.0, Allowed(period=360.0), True),
-    (-139.0, 136.0, "dB", False), (-17.0, 17.0, "dB", False), (-16.0, 16.0, "dB", True),
+    (-139.0, 136.0, "dB", False), (-17.0, 17.0, "dB", False), (-16.0, 16.0, "dB", True), (-17.0, 17.0, "dBm", False),
     (0.05, 5.0, Allowed(low=0.0, is_log=True), False), (0.1, 0.5, Allowed(low=0.0, is_log=True), True),
     (-230.0, 315.0, Allowed(8.0, 45.0), False), (0.1, 0.2, Allowed(0.05, 5.0, is_log=True), True),
     (0.1, 4.0, Allowed(0.05, 5.0, is_log=True), False), (-900.0, 900.0, Allowed(), True)))
 def test_intervals_of_more_than_half_of_what_is_allowed_say_nothing(low, high, allowed, determined):
-    unit, allowed = ("dB", Allowed()) if allowed == "dB" else ("", allowed)
+    unit, allowed = (allowed, Allowed()) if isinstance(allowed, str) else ("", allowed)
     checked = intervals._checked(Parameter(20.0 if low < 0 else 0.15, low, high, unit, allowed=allowed), 6, 6)
     assert checked.determined is determined
     assert checked.low >= allowed.low and checked.high <= allowed.high
@@ -186,9 +180,3 @@ def test_the_size_of_what_one_fold_does_not_find_is_still_told():
     lacking = replace(model, folds=(without, *model.folds[1:]))
     assert effect_size_db(lacking, 0).low > 0
     assert effect_parameters(lacking)[0].keys() == effect_parameters(model)[0].keys()
-
-
-@pytest.mark.parametrize("unit", ["dB", "dBm"])
-@pytest.mark.parametrize("sd_db, determined", [(1.0, True), (90.0, False)])
-def test_a_level_of_any_reference_is_determined_or_not(unit, sd_db, determined):
-    assert intervals._checked(Parameter.normal(-100.0, sd_db, unit), 6, 6).determined == determined

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from radiotwin.closeloop.crossfit import LogDistanceBase, cross_validate, make_folds
 from radiotwin.closeloop.search.causes import add_causes
-from radiotwin.closeloop.search.stages import SearchInputs, SearchState, search
+from radiotwin.closeloop.search.stages import SearchState, search
 from radiotwin.effects.catalogue.detection_limit import DetectionLimit
 from radiotwin.effects.catalogue.gain_offsets import ReceiverGainOffset
 from radiotwin.links import prepare_links
 from radiotwin.links.limits import with_usual_limits
+from tests.closeloop.looking import based
 
 LIMIT_DB = -97.0
 
@@ -25,10 +25,8 @@ def test_one_fault_has_one_name(open_ground, off_db, limit_moves, named):
     world.gain_db[world.gain_db < limit_db] = np.nan
     world.limit_db = -np.inf
     links = with_usual_limits(prepare_links(open_ground.measured(world), None))
-    folds = make_folds(links, 0)
-    base = LogDistanceBase(None, 0)
-    model = cross_validate(links, base, folds)
-    result = search(SearchState(model), [add_causes], SearchInputs(links, base, folds, (ReceiverGainOffset(), DetectionLimit())))
+    model, inputs = based(links, ReceiverGainOffset(), DetectionLimit())
+    result = search(SearchState(model), [add_causes], inputs)
     assert [each.name for each in result.model.whole.effects] == named
     used_db = [float(np.median(result.model.whole.model.limit_db[links.receiver == receiver])) for receiver in (0, 1)]
     assert used_db == pytest.approx([LIMIT_DB, LIMIT_DB + 6.0 * limit_moves], abs=1.0)

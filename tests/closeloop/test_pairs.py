@@ -2,13 +2,12 @@
 
 import pytest
 
-from radiotwin.closeloop.crossfit import LogDistanceBase, cross_validate, make_folds
 from radiotwin.closeloop.search.causes import add_causes
-from radiotwin.closeloop.search.stages import SearchInputs, SearchState, search
+from radiotwin.closeloop.search.stages import SearchState, search
 from radiotwin.closeloop.verdict.criteria import SelectionCriteria
 from radiotwin.effects.catalogue.gain_offsets import ReceiverGainOffset
 from radiotwin.effects.catalogue.position_errors import DevicePositionError
-from radiotwin.links import prepare_links
+from tests.closeloop.looking import based
 
 
 @pytest.fixture
@@ -18,12 +17,9 @@ def selected(open_ground):
         world = open_ground.fly(2)
         for device, east_m in moved_m.items():
             world.device_m[device, 0] += east_m
-        links = prepare_links(open_ground.measured(world), None)
-        folds = make_folds(links, 0)
-        base = LogDistanceBase(None, 0)
-        model = cross_validate(links, base, folds)
-        return search(SearchState(model), [add_causes], SearchInputs(links, base, folds, (DevicePositionError(), ReceiverGainOffset()),
-                                                        SelectionCriteria(min_probability=min_probability)))
+        model, inputs = based(open_ground.measured(world), DevicePositionError(), ReceiverGainOffset(),
+                              criteria=SelectionCriteria(min_probability=min_probability))
+        return search(SearchState(model), [add_causes], inputs)
     return run
 
 

@@ -127,18 +127,13 @@ def test_what_makes_links_blank_has_no_rival_among_what_changes_levels(open_grou
     assert weaker.features[2] < judge([offset], model, hypotheses, CRITERIA)[0][0].features[2]
 
 
-def test_more_evidence_is_never_less_probable():
-    nats = np.arange(0.0, 300.0, 10.0)
-    found = [probability_of("foliage", features((each,) * 3, 1.0, False)) for each in nats]
-    assert np.all(np.diff(found) > 0)
+def test_evidence_makes_probable_and_a_rest_of_places_or_another_effect_makes_it_worth_less():
+    def chances(nats=(40.0,), ratios=(1.0,), beside=(False,)):
+        return [probability_of("foliage", features((each,) * 3, ratio, there))
+                for each in nats for ratio in ratios for there in beside]
 
-
-def test_where_more_of_the_rest_belongs_to_places_the_same_evidence_is_worth_less():
-    found = [probability_of("foliage", features((40.0,) * 3, ratio, False)) for ratio in (0.3, 1.0, 3.0, 9.0)]
-    assert np.all(np.diff(found) < 0)
-
-
-def test_beside_an_effect_of_another_kind_the_same_evidence_is_worth_less():
-    alone, beside = (probability_of("foliage", features((40.0,) * 3, 1.0, there)) for there in (False, True))
+    assert np.all(np.diff(chances(nats=np.arange(0.0, 300.0, 10.0))) > 0)
+    assert np.all(np.diff(chances(ratios=(0.3, 1.0, 3.0, 9.0))) < 0)
+    alone, beside = chances(beside=(False, True))
     assert beside < 0.8 * alone
     assert needed_nats("foliage", 0.5, 1.0, True) > needed_nats("foliage", 0.5, 1.0)

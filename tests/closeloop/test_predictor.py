@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 
 from radiotwin.closeloop import crossfit as cross_validation
-from radiotwin.closeloop.crossfit import cross_validate, make_bases, make_folds
 from radiotwin.closeloop.predict import predictor
 from radiotwin.closeloop.predict.predictor import combined_prediction
 from radiotwin.closeloop.predict.weights import Combination
 from radiotwin.links import prepare_links
 from radiotwin.twin.model.blend import FORESTS, LEVEL_FORESTS
+from tests.closeloop.looking import based
 
 
 @pytest.fixture(autouse=True)
@@ -30,8 +30,7 @@ def flown(open_ground, seed, part=6, **options):
 
 def predicted(links, with_shadowing=False):
     """Return folds and the combination upon the log-distance law, without any effect."""
-    folds = make_folds(links, 0)
-    model = cross_validate(links, make_bases(None, 0)["log-distance"], folds)
+    model, _ = based(links)
     return model, combined_prediction(model, with_shadowing, 0)
 
 

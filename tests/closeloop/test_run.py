@@ -43,67 +43,59 @@ def test_a_receiver_that_reads_too_much_is_named_and_measured(open_ground):
     assert report["error"]["after"]["rmse_db"] < 1.05 * 2.0 < report["error"]["before"]["rmse_db"]
 
 
+def cardioid(world):
+    """Of a device that is seen from all sides; it is not the pattern that is fitted."""
+    mine = world.device == np.abs(world.device_m[:, :2] - 250).max(axis=1).argmin()
+    azimuth_deg = np.degrees(np.arctan2(world.offset_m[:, 0], world.offset_m[:, 1]))
+    world.gain_db[mine] += 20 * np.log10(0.08 + 0.46 * (1 + np.cos(np.radians(azimuth_deg[mine] - 70))))
+    return f"azimuth_deg[d{world.device[mine][0]}]"
+
+
+def anchor_elsewhere(world):
+    """Declared 45 m too far west."""
+    world.device_m[1, 0] += 45.0
+
+
+def clock(world):
+    """Each level of a receiver is written beside the position of three seconds before."""
+    there = np.flatnonzero((world.receiver == 1) & (world.slot >= 3))
+    world.receiver_m[there] = world.receiver_m[there - 3 * len(world.device_m)].copy()
+
+
+def raised(change_db):
+    def change(world):
+        world.gain_db += change_db(world)
+    return change
+
+
+FAULTS = (  # seed, change of a world, effect, values with their tolerance
+    (3, raised(lambda w: 7.0 * 0.5 ** (w.slot / 10.0) * (w.receiver == 0)), "receiver_drift",
+     {"warm_up_each_flight_db[r0]": (7.0, 1.5)}),
+    (4, raised(lambda w: -6.0 * ((w.receiver == 1) & (w.time_s > 530))), "receiver_drift", {"step_db[r1]": (-6.0, 1.0)}),
+    # The other flights do not show it.
+    (7, raised(lambda w: 12.0 * ((w.receiver == 1) & (w.flight == 0))), "receiver_drift",
+     {"step_db[r1]": (-12.0, 1.0), "step_time_s[r1]": (130.0, 71.0)}),
+    (7, raised(lambda w: -12.0 * np.exp(-w.time_s / 40.0) * (w.receiver == 1)), "receiver_drift",
+     {"warm_up_db[r1]": (-12.0, 2.0), "time_constant_s[r1]": (40.0, 10.0)}),
+    (10, raised(lambda w: -7.0 * ((w.device == 2) & (w.time_s > 530))), "device_drift", {"step_db[d2]": (-7.0, 1.0)}),
+    (11, clock, "receiver_clock_offset", {"positions_late_by_s[r1]": (3.0, 0.7)}),
+    (5, cardioid, "antenna_pattern", {"": (70.0, 20.0)}),
+    (6, anchor_elsewhere, "device_position_error", {}))
+
+
 @pytest.mark.slow
-def test_a_receiver_that_warms_up_is_named_and_not_an_offset(open_ground):
-    world = open_ground.fly(3)
-    mine = world.receiver == 0
-    world.gain_db[mine] += 7.0 * 0.5 ** (world.slot[mine] / 10.0)
+@pytest.mark.parametrize(("seed", "change", "effect", "values"), FAULTS, ids=[each[2] for each in FAULTS])
+def test_what_was_done_to_a_world_is_named_and_measured(open_ground, seed, change, effect, values):
+    world = open_ground.fly(seed)
+    position_m = world.device_m.copy()
+    parameter = change(world)
     report = run(open_ground.measured(world))
-    assert named(report)[0] == "receiver_drift"
-    assert value(report, "receiver_drift", "warm_up_each_flight_db[r0]") == pytest.approx(7.0, abs=1.5)
-
-
-@pytest.mark.slow
-def test_a_step_in_time_is_found_where_it_is(open_ground):
-    world = open_ground.fly(4)
-    world.gain_db[(world.receiver == 1) & (world.time_s > 530)] -= 6.0
-    report = run(open_ground.measured(world))
-    assert named(report)[0] == "receiver_drift"
-    assert value(report, "receiver_drift", "step_db[r1]") == pytest.approx(-6.0, abs=1.0)
-
-
-@pytest.mark.slow
-def test_a_step_after_the_first_flight_is_found_though_no_other_flight_shows_it(open_ground):
-    world = open_ground.fly(7)
-    world.gain_db[(world.receiver == 1) & (world.flight == 0)] += 12.0
-    report = run(open_ground.measured(world))
-    assert named(report) == ["receiver_drift"]
-    assert value(report, "receiver_drift", "step_db[r1]") == pytest.approx(-12.0, abs=1.0)
-    assert 59 <= value(report, "receiver_drift", "step_time_s[r1]") <= 200
-
-
-@pytest.mark.slow
-def test_a_warm_up_that_only_the_first_flight_shows_is_no_step(open_ground):
-    world = open_ground.fly(7)
-    world.gain_db[world.receiver == 1] -= 12.0 * np.exp(-world.time_s[world.receiver == 1] / 40.0)
-    report = run(open_ground.measured(world))
-    assert named(report) == ["receiver_drift"]
-    assert value(report, "receiver_drift", "warm_up_db[r1]") == pytest.approx(-12.0, abs=2.0)
-    assert value(report, "receiver_drift", "time_constant_s[r1]") == pytest.approx(40.0, abs=10.0)
-
-
-@pytest.mark.slow
-def test_a_device_that_has_changed_is_named(open_ground):
-    world = open_ground.fly(10)
-    world.gain_db[(world.device == 2) & (world.time_s > 530)] -= 7.0
-    report = run(open_ground.measured(world))
-    assert named(report) == ["device_drift"]
-    assert value(report, "device_drift", "step_db[d2]") == pytest.approx(-7.0, abs=1.0)
-
-
-@pytest.mark.slow
-def test_a_receiver_whose_clock_is_wrong_is_named(open_ground):
-    world = open_ground.fly(11)
-    mine, late_s = world.receiver == 1, 3  # each level is written beside the position of three seconds before
-    there = np.flatnonzero(mine & (world.slot >= late_s))
-    before = there - late_s * len(world.device_m)  # the same device and flight, so many slots ago
-    measurements = open_ground.measured(world)
-    columns = [f"receiver_{axis}_m" for axis in "xyz"]
-    measurements.table.loc[there, columns] = world.receiver_m[before]
-    measurements = measurements.select(~mine | (world.slot >= late_s))
-    report = run(measurements)
-    assert named(report) == ["receiver_clock_offset"]
-    assert value(report, "receiver_clock_offset", "positions_late_by_s[r1]") == pytest.approx(late_s, abs=0.7)
+    assert named(report)[0] == effect
+    for name, (expected, within) in values.items():
+        assert value(report, effect, name or parameter) == pytest.approx(expected, abs=within)
+    if effect == "device_position_error":
+        found_m = [value(report, effect, f"{axis}_m[d1]") for axis in "xy"]
+        assert found_m == pytest.approx(position_m[1, :2], abs=10)
 
 
 @pytest.mark.slow
@@ -123,31 +115,6 @@ def test_what_no_effect_explains_is_filled_in_over_the_variable_that_it_depends_
     assert "time_in_flight_s" in [each["variable"] for each in report["remaining"]["drivers"]]
     assert value(report, "unexplained_trend", "rise_and_fall_db[time_in_flight_s]") == pytest.approx(6.0, abs=1.0)
     assert report["error"]["after"]["rmse_db"] < 1.1 * 2.0 < report["error"]["before"]["rmse_db"]
-
-
-@pytest.mark.slow
-def test_a_sector_antenna_is_named_and_its_direction_found(open_ground):
-    world = open_ground.fly(5)
-    mine = world.device == np.abs(world.device_m[:, :2] - 250).max(axis=1).argmin()  # seen from all sides
-    device = world.device[mine][0]
-    azimuth_deg = np.degrees(np.arctan2(world.offset_m[:, 0], world.offset_m[:, 1]))
-    # A cardioid, which is not the pattern that is fitted.
-    world.gain_db[mine] += 20 * np.log10(0.08 + 0.46 * (1 + np.cos(np.radians(azimuth_deg[mine] - 70))))
-    report = run(open_ground.measured(world))
-    assert named(report)[0] == "antenna_pattern"
-    found = value(report, "antenna_pattern", f"azimuth_deg[d{device}]")
-    assert abs((found - 70 + 180) % 360 - 180) < 20
-
-
-@pytest.mark.slow
-def test_an_anchor_that_is_elsewhere_is_found(open_ground):
-    world = open_ground.fly(6)
-    measurements = open_ground.measured(world)
-    measurements.devices.loc[1, "x_m"] += 45.0  # declared wrongly
-    report = run(measurements)
-    assert named(report)[0] == "device_position_error"
-    assert value(report, "device_position_error", "x_m[d1]") == pytest.approx(world.device_m[1, 0], abs=10)
-    assert value(report, "device_position_error", "y_m[d1]") == pytest.approx(world.device_m[1, 1], abs=10)
 
 
 @pytest.mark.slow

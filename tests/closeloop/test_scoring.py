@@ -1,6 +1,7 @@
+"""What a candidate is held against before it is fitted along paths."""
+
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -43,61 +44,41 @@ def moved(make_links):
     return SimpleNamespace(whole=Model.build(links, channel, 5.0).fit(), links=links), channel
 
 
-class Sentenced(DevicePositionError):
-    """A position that its map speaks against."""
+class Asked(DevicePositionError):
+    """A position that remembers the links that it was held against, and what they say."""
+
+    def __init__(self, answer=""):
+        super().__init__()
+        self.links, self.answer = [], answer
 
     def contradicted(self, links):
-        return "a lake is there"
+        self.links.append(links)
+        return self.answer
 
 
-def fitted(moved, evidence_nats, effect=DevicePositionError):
-    model, channel = moved
-    hypotheses = SimpleNamespace(effect_evidence_nats=lambda *_: evidence_nats)
-    channel.followed = 0
-    return fit_candidate(model, effect(), SelectionCriteria(), hypotheses), channel.followed
+def fitted(model, effect, hypotheses=None):
+    return fit_candidate(model, effect, SelectionCriteria(), hypotheses)
 
 
 def test_paths_are_followed_whatever_quick_levels_say(moved):
-    found, followed = fitted(moved, -1.0)
-    assert isinstance(found, Candidate) and followed and found.whole.effects[-1].params.device == 0
+    model, channel = moved
+    found = fitted(model, DevicePositionError(), SimpleNamespace(effect_evidence_nats=lambda *_: -1.0))
+    assert isinstance(found, Candidate) and channel.followed and found.whole.effects[-1].params.device == 0
 
 
 def test_no_paths_are_followed_for_what_the_map_speaks_against(moved):
-    refused, followed = fitted(moved, 1.0, Sentenced)
-    assert refused.reason == "a lake is there" and not followed
-
-
-class OfUsable(DevicePositionError):
-    """A position that remembers of which devices the links are that the map is asked about."""
-
-    asked: ClassVar[set[int]] = set()
-
-    def contradicted(self, links):
-        self.asked.update(links.device.tolist())
+    model, channel = moved
+    channel.followed = 0
+    assert fitted(model, Asked("a lake is there")).reason == "a lake is there" and not channel.followed
 
 
 def test_links_of_devices_that_are_nowhere_do_not_speak_against_anything(moved):
     model, _ = moved
     lost = SimpleNamespace(links=model.links, whole=replace(model.whole, model=replace(
         model.whole.model, usable=model.links.device == 0)))
-    effect = OfUsable()
-    assert isinstance(fit_candidate(lost, effect, SelectionCriteria(), None), Candidate)
-    assert effect.asked == {0}
-
-
-class OverMap(MissingObstacle):
-    """A box that notes the maps that it is held against."""
-
-    def __init__(self):
-        super().__init__()
-        self.heights_m = []
-
-    def propose(self, view):
-        return [self.Params(box=Box(90.0, 60.0, 20.0, 20.0, 15.0, 0.0))]
-
-    def contradicted(self, links):
-        self.heights_m.append(float(links.city.height_at(40.0, 60.0)))
-        return "it is noted"
+    effect = Asked()
+    assert isinstance(fitted(lost, effect), Candidate)
+    assert set(effect.links[0].device) == {0}
 
 
 def test_a_building_that_was_found_is_in_the_map_that_the_next_is_held_against(moved):
@@ -105,9 +86,7 @@ def test_a_building_that_was_found_is_in_the_map_that_the_next_is_held_against(m
     house = trimesh.creation.box(bounds=[[400, 400, 0], [410, 410, 10]])
     whole = replace(model.whole.model, links=model.whole.links.with_city(CityMap(house.vertices, house.faces)))
     for found, height_m in (([], 0.0), ([Box(40.0, 60.0, 20.0, 20.0, 25.0, 0.0)], 25.0)):
-        effect = OverMap()
-        applied = [MissingObstacle().with_params(MissingObstacle.Params(box=box)) for box in found]
-        base = whole.with_effects(applied).fit()
-        over = SimpleNamespace(whole=base, links=base.links)
-        refused = fit_candidate(over, effect, SelectionCriteria(), None)
-        assert refused.reason == "it is noted" and effect.heights_m == [pytest.approx(height_m)]
+        base = whole.with_effects([MissingObstacle().with_params(MissingObstacle.Params(box=box)) for box in found]).fit()
+        effect = Asked("it is noted")
+        assert fitted(SimpleNamespace(whole=base, links=base.links), effect).reason == "it is noted"
+        assert float(effect.links[0].city.height_at(40.0, 60.0)) == pytest.approx(height_m)

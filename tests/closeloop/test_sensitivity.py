@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from radiotwin.closeloop.output.result_file import _for_json
 from radiotwin.closeloop.verdict.criteria import SelectionCriteria
 from radiotwin.closeloop.verdict.sensitivity import detectable, needed_nats
 from radiotwin.effects import GainEffect, catalogue
@@ -59,11 +58,6 @@ def test_every_family_that_was_looked_for_has_a_size_within_what_it_may_have(not
 def test_more_evidence_is_needed_for_more_certainty_and_beside_a_larger_rest():
     assert needed_nats("foliage", 0.5, 1.0) <= needed_nats("foliage", 0.9, 1.0) <= needed_nats("foliage", 0.9, 4.0)
     assert needed_nats("foliage", 1.0, 1.0) == np.inf
-
-
-def test_where_no_size_would_be_seen_there_is_none(nothing_hidden, sizes):
-    found = sizes(*nothing_hidden, "receiver_drift", "foliage", criteria=replace(CRITERIA, min_probability=1.0))
-    assert set(found.values()) == {np.inf} and set(_for_json([*found.values()])) == {None}
 
 
 def test_without_a_frequency_nothing_is_said_of_what_depends_on_it(nothing_hidden, sizes):

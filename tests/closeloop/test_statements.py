@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from radiotwin.closeloop.families import Readings
 from radiotwin.closeloop.output.result_file import _explained_share, consistent_sizes, constant_over
 from radiotwin.closeloop.scan import scan
 from radiotwin.closeloop.scan_sensitivity import least_deviations
@@ -44,7 +45,7 @@ def test_a_device_that_is_off_by_what_would_have_been_seen_is_seen():
     assert 0.5 < least < 10.0
     for share, is_seen in ((0.3, False), (1.5, True)):
         off = table.assign(gain_db=table["gain_db"] + share * least * (table["device"] == "d1"))
-        sure = [each.members for each in scan(of_base(off)) if each.probability >= 0.9]
+        sure = [each.members for each in scan(Readings.of(of_base(off))) if each.probability >= 0.9]
         assert ({"device": ("d1",)} in sure) == is_seen
 
 

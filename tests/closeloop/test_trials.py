@@ -1,9 +1,5 @@
 """The log of trials: nothing in it changes, and the last word on each trial counts."""
 
-import dataclasses
-
-import pytest
-
 from radiotwin.closeloop.search.trials import Trial, TrialLog
 
 
@@ -25,18 +21,6 @@ def test_two_trials_of_one_effect_are_two():
     log = TrialLog().record(Trial("foliage", step=1).keep(), Trial("foliage", step=1))
     assert words(log.supersede(log.trials[1].refuse("one is enough"))) == [
         ("foliage", True, ""), ("foliage", False, "one is enough")]
-
-
-@pytest.mark.parametrize("number", [None, 1])
-def test_what_was_never_recorded_cannot_be_superseded(number):
-    log = TrialLog().record(Trial("foliage"))
-    with pytest.raises(ValueError, match="trials of episode are not in the log: record them"):
-        log.supersede(Trial("episode", number=number))
-
-
-def test_a_trial_cannot_be_changed():
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        Trial("foliage").kept = True
 
 
 def test_open_is_what_nothing_speaks_against_before_it_is_kept():

@@ -5,11 +5,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from radiotwin.closeloop.crossfit import LogDistanceBase, cross_validate, make_folds
 from radiotwin.closeloop.output.result_file import errors
 from radiotwin.links import prepare_links
 from radiotwin.links.limits import with_usual_limits
 from radiotwin.links.measurements import Measurements
+from tests.closeloop.looking import based
 
 LIMIT_DBM, DEFAULT_DBM, LINKS = -140.0, -120.0, 2000
 DEVICE_M = [(20.0, 20.0, 10.0), (150.0, 130.0, 10.0)]
@@ -36,8 +36,7 @@ def walked(seed, scene):
 def held_out(links):
     """Return errors of links in blocks that the law was not fitted to."""
     links = with_usual_limits(links)
-    folds = make_folds(links, 0, "block")
-    model = cross_validate(links, LogDistanceBase(None, 0), folds)
+    model, _ = based(links, by="block")
     return errors(links.level_db, model.held_out_mean_db)
 
 

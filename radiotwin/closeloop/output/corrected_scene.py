@@ -111,12 +111,7 @@ def _corrected_buildings(scene: Scene, shapes_of: dict[int, set[str]], left: set
                         roofs: list[Roof], base_m: np.ndarray) -> pd.DataFrame | None:
     """Return the corrected `buildings.csv` of a scene, as texts; None if the scene has none.
 
-    Args:
-        scene: declared scene.
-        shapes_of: names of the shapes in `city.xml`, by building.
-        left: names of the shapes in the corrected scene; rows of other shapes are dropped.
-        roofs: roofs with corrected heights.
-        base_m: (buildings,) height of the ground under each building [m].
+    Rows of shapes that are not `left` in the corrected scene are dropped.
     """
     path = scene.folder / "buildings.csv"
     if not path.is_file():
@@ -224,11 +219,7 @@ def write_corrected_scene(loop: Loop, scene: Scene, folder: Path) -> list[str]:
 
 def _moved(found: Sequence[Correction], links: Links, scene: Scene,
            city: CityMap | None) -> tuple[SceneConfig, list[str]]:
-    """Move anchors to their corrected positions, or the nearest ones outside buildings of `city`.
-
-    Returns:
-        the configuration, and a sentence for each anchor.
-    """
+    """Move anchors to their corrected positions, or the nearest ones outside of buildings."""
     found_m: dict[str, np.ndarray] = {}
     for each in found:
         for row, move_m in each.moves_m.items():
@@ -328,11 +319,7 @@ def _with_roofs(mesh: trimesh.Trimesh, label: np.ndarray, roofs: list[Roof],
                 base_m: np.ndarray) -> trimesh.Trimesh:
     """Stretch the buildings of a mesh vertically to their corrected roof heights.
 
-    Args:
-        mesh: mesh with f faces; it may have a building's roof without its walls.
-        label: (f,) building of each face.
-        roofs: corrected roofs.
-        base_m: (buildings,) height of the ground under each building [m].
+    The mesh may have a building's roof without its walls; `label` (f,) is the building of a face.
     """
     vertices_m = np.array(mesh.vertices, dtype=float)
     for roof in roofs:

@@ -327,13 +327,8 @@ def _explained_share(anomaly: Anomaly, residual_db: np.ndarray, change_db: np.nd
     """Return the share of an anomaly that an effect explains; about 1 = all.
 
     For a level, this is the effect's change of the group relative to its peers. A scatter or curve
-    is explained as far as the residual's spread shrinks when the change is subtracted.
-
-    Args:
-        anomaly: a group of n links.
-        residual_db: (n,) held-out residual of the base.
-        change_db: (n,) change of the predicted level by the effect.
-        scatter_sd_db: (n,) standard deviation that the effect adds to readings; None: none.
+    is explained as far as the residual's spread shrinks when the change is subtracted, or as far as
+    the effect adds scatter to the group's readings alone.
     """
     seen = np.isfinite(residual_db) & np.isfinite(change_db)
     rows, size = seen & anomaly.rows, anomaly.size.value

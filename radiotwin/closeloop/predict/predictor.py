@@ -143,17 +143,7 @@ def combined_fit(model: CrossFit, found: Combination, seed: int) -> FittedModel:
 def _learn(fit: Fit, part: Part, names: Collection[str], seed: int, trees: int = TREES,
            shadowing: CorrelatedShadowing | None = None,
            laws: dict[str, ChannelModel] | None = None) -> FittedModel:
-    """Learn the predictors of a combination (effects, trees, laws, …), all with equal weights.
-
-    Args:
-        fit: fit to the training links among n links.
-        part: the n links with the features of trees.
-        names: names of the predictors.
-        seed: random seed of trees and samples.
-        trees: number of trees.
-        shadowing: interpolated residual (shadowing); None: it is fitted if it is a predictor.
-        laws: laws that were fitted already, by name.
-    """
+    """Learn the predictors of a combination (effects, trees, laws, …), all with equal weights."""
     if SHADOWED in names:
         shadowing = shadowing or fit.shadowing or fit.fit_shadowing(seed)
     laws = laws or {kind.name: fitted_law(kind, fit.links, fit.train)
@@ -165,7 +155,7 @@ def _learn(fit: Fit, part: Part, names: Collection[str], seed: int, trees: int =
     declared = np.flatnonzero(np.isfinite(boresight_deg))
     blend = Blend(dict.fromkeys(names, (1 / len(names), 1 / len(names))), HALF_M, (1.0, 1.0), move,
                   places[:, :3].astype(np.float32), places[:, 3].astype(int),  # as they are stored
-                  grow_forests(fit, part, seed, names, trees),
+                  _grow_forests(fit, part, seed, names, trees),
                   {name: law for name, law in laws.items() if name in names},
                   np.column_stack([declared, boresight_deg[declared]]))
     return replace(fit.learnt, shadowing=shadowing or fit.shadowing, blend=blend)
@@ -228,19 +218,12 @@ def _quadrant(links: Links) -> np.ndarray:
     return above @ np.array([1, 2])
 
 
-def grow_forests(fit: Fit, part: Part, seed: int, names: Collection[str],
+def _grow_forests(fit: Fit, part: Part, seed: int, names: Collection[str],
                   trees: int = TREES) -> dict[str, Forest]:
     """Grow trees on training links: for the standardised residual (`FORESTS`) and for the level.
 
-    For a blank link, its expected value below the limit of detection is used. The receiver is no
-    feature, since a map is for a faultless receiver.
-
-    Args:
-        fit: fit to some of n links.
-        part: the n links with features.
-        seed: random seed of the trees.
-        names: names of the predictors; only the forests among them are grown.
-        trees: number of trees.
+    Only the forests among `names` are grown. For a blank link, its expected value below the limit
+    of detection is used. The receiver is no feature, since a map is for a faultless receiver.
     """
     if not set(names) & set(FORESTS + LEVEL_FORESTS):
         return {}

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.special import softmax
 
 from radiotwin.closeloop.crossfit import CrossFit
+from radiotwin.closeloop.families import Readings
 from radiotwin.closeloop.scan import Anomaly, scan
 from radiotwin.closeloop.search.faults import (
     score_with_fixed_parameters,
@@ -55,7 +56,7 @@ def add_causes_of_anomalies(state: SearchState, inputs: SearchInputs) -> SearchS
                 state, causes = _with_cause(state, anomaly, inputs)
                 anomaly = replace(anomaly, causes=causes)
                 if state.model is not before:
-                    remaining, latest = scan(state.model), causes
+                    remaining, latest = scan(Readings.of(state.model)), causes
         explained.append(anomaly)
     return replace(state, anomalies=tuple(explained))
 
@@ -66,9 +67,6 @@ def _with_cause(state: SearchState, anomaly: Anomaly, inputs: SearchInputs
 
     The effects that can act on such a group are fitted to it and compared by their evidence. The
     likeliest is named if it reaches `min_probability` and passes on held-out links, else the next.
-
-    Returns:
-        the state, with one more effect if a cause is named; the probability of each cause by name.
     """
     model, criteria = state.model, inputs.criteria
     ends = [name for names in anomaly.members.values() for name in names]

@@ -149,11 +149,7 @@ def _score(state: SearchState, candidates: list[Candidate], inputs: SearchInputs
            is_needless: Callable[..., bool] = lambda *_: False) -> list[Tried]:
     """Score the candidates of a step on held-out links, in the order of their training gain.
 
-    Args:
-        state: state of the search.
-        candidates: effects fitted to all links.
-        inputs: inputs of the search.
-        is_needless: returns whether an effect that passed makes scoring a candidate needless.
+    Not scored are those that an effect that passed makes needless (`is_needless`).
     """
     model, step = state.model, state.step
     tried: list[Tried] = []
@@ -180,9 +176,6 @@ def _judge_step(state: SearchState, tried: list[Tried], hypotheses: Hypotheses,
 
     A probable candidate is refused, too, if its size on held-out links may be 0. Trials that
     earlier stages made with the same model compete as rivals and get new probabilities.
-
-    Returns:
-        the state with a summary of the step, and the candidates with their new trials.
     """
     step, earlier = state.step, state.log.of_step(state.step)
     judged, summary = judge([*earlier, *(each.trial for each in tried)], state.model, hypotheses,
@@ -206,18 +199,10 @@ def _all_confirmed(model: CrossFit, last: int) -> bool:
 
 def _probable_together(state: SearchState, supported: Sequence[Tried],
                       inputs: SearchInputs) -> list[Tried]:
-    """Search for a set of effects that is probable, though none of them is probable by itself.
+    """Search for a set of effects that is probable, though none is by itself; else return [].
 
-    The most probable effect is extended by a second one, then by repeats of itself while they make
-    the set more probable.
-
-    Args:
-        state: state of the search, with the step's summary.
-        supported: candidates that passed on held-out links.
-        inputs: inputs of the search.
-
-    Returns:
-        effects in the order in which they were added; empty if no set is probable enough.
+    The most probable of the effects that held-out links support is extended by a second one, then
+    by repeats of itself while they make the set more probable.
     """
     criteria, step = inputs.criteria, state.steps[-1]
     ranked = sorted(supported, key=lambda each: -each.trial.probability)

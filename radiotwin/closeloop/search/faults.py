@@ -123,7 +123,8 @@ def _refuse_lasting(faults: list[Candidate | Trial], state: SearchState,
 
     A receiver that changed for good also looks faulty in each window of time afterwards. Only
     effects that the faults name as `confused_with` are fitted as rivals. A rival that gains at
-    least as many nats on the training links wins, and the fault becomes a refused `Trial`.
+    least as many nats on the training links, and acts on at least the share `MIN_SHARED` of the
+    fault's links, wins, and the fault becomes a refused `Trial`.
     """
     rivals = {name for each in faults if isinstance(each, Candidate)
               for name in each.effect.confused_with}
@@ -131,26 +132,20 @@ def _refuse_lasting(faults: list[Candidate | Trial], state: SearchState,
               for effect in inputs.undeclared if effect.name in rivals
               and not effect.within_flights and not effect.unavailable(state.model.links)]
     lasting = [each for each in fitted if isinstance(each, Candidate)]
-    return [_refuse_if_lasting(each, lasting, state.step) if isinstance(each, Candidate) else each
-            for each in faults]
-
-
-def _refuse_if_lasting(fault: Candidate, lasting: list[Candidate],
-                       step: int) -> Candidate | Trial:
-    """Return a fault, or a refused trial if one of the lasting effects explains as much.
-
-    That effect can be confused with the fault, gains at least as much on the training links, and
-    acts on at least the share `MIN_SHARED` of the fault's links.
-    """
-    faulty = _affected_links(fault)
-    rival = next((each for each in lasting if each.effect.name in fault.effect.confused_with
-                  and each.gain_nats >= fault.gain_nats
-                  and _affected_links(each)[faulty].mean() >= MIN_SHARED), None)
-    if rival is None:
-        return fault
-    return Trial(fault.effect.name, step=step, variant=fault.effect.variant, reason=(
-        f"{rival.effect.name} explains as much: {rival.gain_nats:.0f} nats of the links that it is "
-        f"fitted to, and this {fault.gain_nats:.0f}"))
+    left = list(faults)
+    for place, fault in enumerate(faults):
+        if isinstance(fault, Trial):
+            continue
+        faulty = _affected_links(fault)
+        rival = next((each for each in lasting if each.effect.name in fault.effect.confused_with
+                      and each.gain_nats >= fault.gain_nats
+                      and _affected_links(each)[faulty].mean() >= MIN_SHARED), None)
+        if rival is not None:
+            left[place] = Trial(fault.effect.name, step=state.step, variant=fault.effect.variant,
+                                reason=(f"{rival.effect.name} explains as much: "
+                                        f"{rival.gain_nats:.0f} nats of the links that it is "
+                                        f"fitted to, and this {fault.gain_nats:.0f}"))
+    return left
 
 
 def _affected_links(candidate: Candidate) -> np.ndarray:

@@ -100,15 +100,7 @@ def _located_anew(fit: Fit, links: Links, train: np.ndarray, base: Base,
                   devices: list[int]) -> tuple[Model, list[TwinDevice]]:
     """Locate devices by paths over the corrected map, from the training links of one fit.
 
-    Args:
-        fit: fit with the effects that correct the map.
-        links: the n links to which the base was fitted.
-        train: (n,) bool, training links.
-        base: base that follows paths.
-        devices: devices to locate; others keep the fit's position.
-
-    Returns:
-        the model at the new positions, not fitted yet, and the located devices.
+    Other devices keep the fit's position. The returned model is not fitted yet.
     """
     model = fit.model
     fixed = np.setdiff1d(model.links.device[model.usable], devices).tolist()

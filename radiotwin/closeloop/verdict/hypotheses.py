@@ -289,12 +289,6 @@ def _nearest_links(series: np.ndarray, track: np.ndarray, position_m: np.ndarray
 
     They are of the same fixed end and track, or of any track if this has too few: another flight
     may scatter less. A link whose fixed end has too few gets its own row in all places.
-
-    Args:
-        series: (n,) label of the fixed end.
-        track: (n,) label of receiver and flight.
-        position_m: (n, 3) position of the moving end [m].
-        known: (n,) bool, links with a residual.
     """
     near = np.repeat(np.arange(len(series))[:, None], NEIGHBOURS, axis=1)
     for labels in (series[:, None], np.column_stack([series, track])):

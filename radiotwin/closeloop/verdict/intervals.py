@@ -75,15 +75,10 @@ def _path_derivatives(whole: Linearised, fold: Fit) -> dict[int, list[ReadingDer
 
 
 def _with_jackknife(parameter: Parameter, folds: list[Parameter], count: int) -> Parameter:
-    """Widen the interval of a parameter to the spread of its estimates in folds.
+    """Widen the interval of a parameter to the spread of its estimates in the `folds` that have it.
 
     Folds whose own interval is more than `MAX_WIDTH` times as wide are ignored. `determined` is set
-    as in `_checked`.
-
-    Args:
-        parameter: estimate from all links, with its sandwich interval.
-        folds: estimates without one fold each, of the folds that have the effect.
-        count: number of all folds.
+    as in `_checked`; `count` is the number of all folds.
     """
     max_width = MAX_WIDTH * _width(parameter)
     values = [each.value for each in folds if not max_width > 0 or _width(each) <= max_width]
@@ -210,13 +205,8 @@ def _size_regression(model: CrossFit, number: int
 def _slope_half_width(influence: np.ndarray, share: np.ndarray, label: np.ndarray) -> float:
     """Return half the 90 % interval of the slope, with errors clustered by a label (n,).
 
-    Args:
-        influence: (n,) change of the estimated slope that each link causes.
-        share: (n,) share of the information on the slope that each link gives.
-        label: (n,) cluster of each link.
-
-    Returns:
-        0 if there are fewer than `MIN_CLUSTERS` effective clusters.
+    Each link has its influence on the estimate, and its share of the information. 0 if there are
+    fewer than `MIN_CLUSTERS` effective clusters.
     """
     cluster = np.unique(label, return_inverse=True)[1].ravel()
     shares = np.bincount(cluster, weights=share)

@@ -196,11 +196,7 @@ def _probability_of_nothing(named_nats: float, unnamed_nats: float, rest_db: flo
                             noise_db: float) -> float:
     """Return the probability that nothing is hidden, if no effect of the catalogue is present.
 
-    Args:
-        named_nats: evidence for the best effect of the catalogue.
-        unnamed_nats: evidence for the best unnamed curve.
-        rest_db: standard deviation of the residual that depends on the place.
-        noise_db: standard deviation of noise.
+    The evidence is for the best effect of the catalogue and for the best unnamed curve.
     """
     weights = calibration()["nothing"]
     values = [*np.arcsinh(np.array([named_nats, unnamed_nats]) / NATS), np.log(max(rest_db, 0.1)),
