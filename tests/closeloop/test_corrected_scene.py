@@ -55,7 +55,8 @@ def loop_of(scene, *found):
 def corrected(folder, scene, *found, name=None):
     """Return what is told of a scene that is written as a loop found it, and that scene; `name`: of its first device."""
     loop = loop_of(scene, *found)
-    loop.after.whole.links.device_names[:1] = [name or loop.after.whole.links.device_names[0]]
+    if name:
+        loop.after.whole.links.device_names[0] = name
     return write_corrected_scene(loop, scene, folder), Scene.load(folder)
 
 
