@@ -16,13 +16,8 @@ from radiotwin.closeloop.output.corrected_scene import (
     check_corrected_target,
     write_corrected_scene,
 )
+from radiotwin.effects import registry
 from radiotwin.effects.boxes import buildings
-from radiotwin.effects.catalogue.gain_drift import ReceiverDrift
-from radiotwin.effects.catalogue.missing_obstacle import MissingObstacle
-from radiotwin.effects.catalogue.position_errors import DevicePositionError
-from radiotwin.effects.catalogue.removed_obstacle import RemovedObstacle
-from radiotwin.effects.catalogue.roof_heights import RoofHeights
-from radiotwin.effects.catalogue.sector_antenna import SectorAntenna
 from radiotwin.effects.places import Roof
 from radiotwin.errors import BadInput
 from radiotwin.scene import Scene
@@ -75,7 +70,7 @@ def tallest(scene):
 
 def test_a_traced_box_is_in_the_way_as_long_wide_and_turned_as_it_was_found(small_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(corrected_scene, "draw_preview", draw_preview)
-    changes, again = corrected(tmp_path / "new", small_scene, (MissingObstacle, {"box": BOX, "scattered_db": 0.0}))
+    changes, again = corrected(tmp_path / "new", small_scene, (registry.MissingObstacle, {"box": BOX, "scattered_db": 0.0}))
     assert (tmp_path / "new" / "preview.png").stat().st_size > 10_000
     assert changes == ["a box of 24 x 14 m, 70 m high, stands at (130, 45) m"]
     city = again.city
@@ -92,7 +87,7 @@ def test_a_traced_box_is_in_the_way_as_long_wide_and_turned_as_it_was_found(smal
 def test_a_building_that_is_gone_lets_links_through_and_others_do_not(small_scene, tmp_path):
     building, x_m, y_m, height_m = tallest(small_scene)
     (change,), new = corrected(tmp_path / "new", small_scene,
-                               (RemovedObstacle, {"building": building, "centre_m": [x_m, y_m, height_m]}))
+                               (registry.RemovedObstacle, {"building": building, "centre_m": [x_m, y_m, height_m]}))
     assert "is taken out" in change
     city = new.city
     above, below = np.array([[x_m, y_m, height_m + 1]]), np.array([[x_m, y_m, 0.5]])
@@ -118,7 +113,7 @@ def test_roofs_that_are_off_are_raised_and_lowered_and_the_table_follows(tmp_pat
     roofs = tuple(Roof(by_height[height_m], *centres_m[by_height[height_m]].tolist(), offset_m, 0.6)
                   for height_m, offset_m in ((12, 3.0), (9, -4.0)))
     gone = {"building": by_height[20], "centre_m": centres_m[by_height[20]].tolist()}
-    changes, new = corrected(tmp_path / "new", scene, (RoofHeights, {"roofs": roofs}), (RemovedObstacle, gone))
+    changes, new = corrected(tmp_path / "new", scene, (registry.RoofHeights, {"roofs": roofs}), (registry.RemovedObstacle, gone))
     assert any("is 15.0 m high, and 12.0 m on the map" in change for change in changes)
     for each in roofs:
         assert new.city.height_at(each.x_m, each.y_m) == pytest.approx(each.height_m + each.offset_m, abs=1e-3)
@@ -141,7 +136,7 @@ def test_an_anchor_that_is_moved_stays_as_high_above_a_slope():
 
 def test_an_anchor_with_no_free_place_near_stays_and_that_is_said(small_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(CityMap, "inside", lambda city, points_m: np.ones(len(points_m), dtype=bool))
-    loop = loop_of(small_scene, (DevicePositionError, {"device": 0, "move_m": [0.0, 20.0]}))
+    loop = loop_of(small_scene, (registry.DevicePositionError, {"device": 0, "move_m": [0.0, 20.0]}))
     (moved,), links = loop.after.whole.effects, loop.after.whole.links
     config, changes = _moved([moved.correction(links)], links, small_scene, small_scene.city)
     assert config.devices[0] == small_scene.config.devices[0]
@@ -156,16 +151,16 @@ def test_one_building_of_a_mesh_that_holds_several(small_scene, tmp_path):
     write_city(tmp_path / "one", [CityShape("all", mesh, itu_material("concrete"))])
     scene = Scene.load(tmp_path / "one")
     building, x_m, y_m, height_m = tallest(scene)
-    _, one = corrected(tmp_path / "new", scene, (RemovedObstacle, {"building": building, "centre_m": (x_m, y_m, height_m)}))
+    _, one = corrected(tmp_path / "new", scene, (registry.RemovedObstacle, {"building": building, "centre_m": (x_m, y_m, height_m)}))
     new = buildings(one.city)[1]
     old = np.delete(buildings(scene.city)[1], building, axis=0)
     assert np.sort(new, axis=0) == pytest.approx(np.sort(old, axis=0))
 
 
 def test_an_anchor_is_where_it_was_found(small_scene, tmp_path):
-    told, new = corrected(tmp_path / "new", small_scene, (DevicePositionError, {"device": 0, "move_m": [0.0, 20.0]}),
-                          (DevicePositionError, {"device": 0, "move_m": [5.0, 0.0]}),
-                          (ReceiverDrift, {"receivers": {0: ("step", 150.0)}}))
+    told, new = corrected(tmp_path / "new", small_scene, (registry.DevicePositionError, {"device": 0, "move_m": [0.0, 20.0]}),
+                          (registry.DevicePositionError, {"device": 0, "move_m": [5.0, 0.0]}),
+                          (registry.ReceiverDrift, {"receivers": {0: ("step", 150.0)}}))
     assert told == ["d0 is moved from (80, 40) to (85, 60) m"]
     assert new.device_m[0] == pytest.approx(small_scene.device_m[0] + (5, 20, 0))
     assert (new.device_m[1:] == small_scene.device_m[1:]).all()
@@ -190,7 +185,7 @@ def rays(azimuth_deg, elevation_deg):
 
 def test_an_antenna_that_was_found_is_declared(small_scene, tmp_path):
     name = small_scene.config.devices[0].device
-    changes, new = corrected(tmp_path / "new", small_scene, (SectorAntenna, {"devices": {0: SECTOR}}))
+    changes, new = corrected(tmp_path / "new", small_scene, (registry.SectorAntenna, {"devices": {0: SECTOR}}))
     assert changes == [f"{name} has a sector antenna that looks to 205° and is 60° wide"]
     antenna, *others = new.device_antennas
     assert others == [None] * len(others)
@@ -200,12 +195,12 @@ def test_an_antenna_that_was_found_is_declared(small_scene, tmp_path):
     np.testing.assert_allclose(gain_dbi - peak_dbi, sector_dbi(azimuth, elevation), atol=0.15)
     weight = np.cos(np.radians(elevation))
     assert 10 * np.log10((weight * 10 ** (gain_dbi / 10)).sum() / weight.sum()) == pytest.approx(0, abs=0.1)
-    again, other = corrected(tmp_path / "new", small_scene, (SectorAntenna, {"devices": {1: SECTOR}}))
+    again, other = corrected(tmp_path / "new", small_scene, (registry.SectorAntenna, {"devices": {1: SECTOR}}))
     assert len(again) == 1 and other.device_antennas[0] is None
 
 
 def test_devices_whose_names_differ_in_a_dot_have_antennas_of_their_own(small_scene, tmp_path):
-    loop = loop_of(small_scene, (SectorAntenna, {"devices": {0: SECTOR, 1: SECTOR | {"beamwidth_deg": 90.0}}}))
+    loop = loop_of(small_scene, (registry.SectorAntenna, {"devices": {0: SECTOR, 1: SECTOR | {"beamwidth_deg": 90.0}}}))
     loop.after.whole.links.device_names = ["bs.1", "bs_1"]
     write_corrected_scene(loop, small_scene, tmp_path / "new")
     first, second = Scene.load(tmp_path / "new").device_antennas[-2:]
@@ -215,13 +210,13 @@ def test_devices_whose_names_differ_in_a_dot_have_antennas_of_their_own(small_sc
 
 @pytest.mark.parametrize("name", ["LTE 262-1-5-7", "BS@1", "02:1b:44:11:3a:b7"])
 def test_an_anchor_that_no_scene_can_name_is_left_out_and_told(small_scene, tmp_path, name):
-    [change], new = corrected(tmp_path / "new", small_scene, (SectorAntenna, {"devices": {0: SECTOR}}), name=name)
+    [change], new = corrected(tmp_path / "new", small_scene, (registry.SectorAntenna, {"devices": {0: SECTOR}}), name=name)
     assert change.startswith(f"{name!r} has a sector antenna, and is not in the scene")
     assert len(new.config.devices) == len(small_scene.config.devices)
 
 
 def test_an_anchor_that_the_scene_lacks_is_declared_with_its_antenna(small_scene, tmp_path):
-    loop = loop_of(small_scene, (SectorAntenna, {"devices": {0: SECTOR}}))
+    loop = loop_of(small_scene, (registry.SectorAntenna, {"devices": {0: SECTOR}}))
     loop.after.whole.links.device_names = ["mast"]
     write_corrected_scene(loop, small_scene, tmp_path / "new")
     first, last = small_scene.config.devices[0], Scene.load(tmp_path / "new").config.devices[-1]
@@ -236,9 +231,9 @@ def test_positions_that_cannot_be_are_moved_to_the_nearest_that_can(small_scene,
     building, x_m, y_m, _ = tallest(small_scene)
     box = [*small_scene.device_m[1, :2] + (8.0, 0.0), 30.0, 20.0, 40.0, 0.0]
     loop = loop_of(
-        small_scene, (DevicePositionError, {"device": 0, "move_m": [x_m - 80.0, y_m - 40.0]}),
-        (DevicePositionError, {"device": 6, "move_m": [0.0, 100.0]}),
-        (MissingObstacle, {"box": box, "scattered_db": 0.0}))
+        small_scene, (registry.DevicePositionError, {"device": 0, "move_m": [x_m - 80.0, y_m - 40.0]}),
+        (registry.DevicePositionError, {"device": 6, "move_m": [0.0, 100.0]}),
+        (registry.MissingObstacle, {"box": box, "scattered_db": 0.0}))
     write_corrected_scene(loop, small_scene, tmp_path / "new")
     new = Scene.load(tmp_path / "new")  # refuses devices inside buildings and outside the extent
     assert new.device_m[6] == pytest.approx((80.0, 300.0, 1.5))
@@ -247,15 +242,15 @@ def test_positions_that_cannot_be_are_moved_to_the_nearest_that_can(small_scene,
 
 
 def test_what_was_corrected_can_be_corrected_again(small_scene, tmp_path):
-    _, scene = corrected(tmp_path / "a", small_scene, (MissingObstacle, {"box": BOX, "scattered_db": 0.0}))
+    _, scene = corrected(tmp_path / "a", small_scene, (registry.MissingObstacle, {"box": BOX, "scattered_db": 0.0}))
     other = [110.0, 100.0, 10.0, 10.0, 50.0, 0.0]
-    _, again = corrected(tmp_path / "b", scene, (MissingObstacle, {"box": other, "scattered_db": 0.0}))
+    _, again = corrected(tmp_path / "b", scene, (registry.MissingObstacle, {"box": other, "scattered_db": 0.0}))
     assert again.city.height_at([110.0, 130.0], [100.0, 45.0]) == pytest.approx([50.0, 70.0])
     assert again.config.provenance["corrected"].count("a box of") == 2
 
 
 def test_where_nothing_is_to_be_corrected_nothing_is_written(small_scene, tmp_path):
-    loop = loop_of(small_scene, (ReceiverDrift, {"receivers": {0: ("step", 150.0)}}))
+    loop = loop_of(small_scene, (registry.ReceiverDrift, {"receivers": {0: ("step", 150.0)}}))
     assert write_corrected_scene(loop, small_scene, tmp_path / "new") == []
     assert not (tmp_path / "new").exists()
 
@@ -284,8 +279,8 @@ def test_sionna_rt_traces_it(small_scene, tmp_path):
     building that blocked it is taken out.
     """
     building, x_m, y_m, height_m = tallest(small_scene)
-    _, new = corrected(tmp_path / "new", small_scene, (MissingObstacle, {"box": BOX, "scattered_db": 0.0}),
-                       (RemovedObstacle, {"building": building, "centre_m": (x_m, y_m, height_m)}))
+    _, new = corrected(tmp_path / "new", small_scene, (registry.MissingObstacle, {"box": BOX, "scattered_db": 0.0}),
+                       (registry.RemovedObstacle, {"building": building, "centre_m": (x_m, y_m, height_m)}))
     links = [*zip(*ends(*BOX[:2], 30.0, 40.0, 60.0)), *zip(*ends(x_m, y_m, 0.0, 60.0, 0.5 * height_m))]
     change_db = []
     for a_m, b_m in links:

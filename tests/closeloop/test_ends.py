@@ -4,22 +4,18 @@ import numpy as np
 import pytest
 
 from radiotwin.closeloop.search.scoring import ends_of
+from radiotwin.effects import registry
 from radiotwin.effects.antennas import SectorPattern
-from radiotwin.effects.catalogue.clock_offset import ReceiverClockOffset
-from radiotwin.effects.catalogue.foliage import Foliage
-from radiotwin.effects.catalogue.gain_offsets import DeviceGainOffset, ReceiverGainOffset
-from radiotwin.effects.catalogue.position_errors import DevicePositionError
-from radiotwin.effects.catalogue.sector_antenna import SectorAntenna
 from radiotwin.links import prepare_links
 
 
 @pytest.mark.parametrize("effect, params, coefficients, devices, receivers", [
-    (DeviceGainOffset(), {"members": [0, 1, 2], "offsets_sd_db": 3.0}, [0.1, -4.0, 0.3], ["d1"], []),
-    (ReceiverGainOffset(), {"members": [0], "offsets_sd_db": 3.0}, [2.0], [], ["r0"]),
-    (DevicePositionError(), {"device": 2, "move_m": (3.0, 4.0)}, [], ["d2"], []),
-    (ReceiverClockOffset(), {"receiver": 1, "offset_s": 2.0, "speed_m_s": 10.0}, [], [], ["r1"]),
-    (SectorAntenna(), {"devices": {0: SectorPattern(), 2: SectorPattern()}}, [0.0, 0.0], ["d0", "d2"], []),
-    (Foliage(), {"box": (0.0, 0.0, 9.0, 9.0, 9.0, 0.0)}, [], [], [])])
+    (registry.DeviceGainOffset(), {"members": [0, 1, 2], "offsets_sd_db": 3.0}, [0.1, -4.0, 0.3], ["d1"], []),
+    (registry.ReceiverGainOffset(), {"members": [0], "offsets_sd_db": 3.0}, [2.0], [], ["r0"]),
+    (registry.DevicePositionError(), {"device": 2, "move_m": (3.0, 4.0)}, [], ["d2"], []),
+    (registry.ReceiverClockOffset(), {"receiver": 1, "offset_s": 2.0, "speed_m_s": 10.0}, [], [], ["r1"]),
+    (registry.SectorAntenna(), {"devices": {0: SectorPattern(), 2: SectorPattern()}}, [0.0, 0.0], ["d0", "d2"], []),
+    (registry.Foliage(), {"box": (0.0, 0.0, 9.0, 9.0, 9.0, 0.0)}, [], [], [])])
 def test_names_are_of_the_ends_that_parameters_belong_to(open_ground, effect, params, coefficients, devices, receivers):
     links = prepare_links(open_ground.measured(open_ground.fly(0)), None)
     names = {"d": list(links.device_names), "r": list(links.receiver_names)}

@@ -9,23 +9,7 @@ import pytest
 from radiotwin.closeloop.output.result_file import make_report
 from radiotwin.closeloop.run import close_loop
 from radiotwin.closeloop.search.stages import SearchState
-from radiotwin.effects.catalogue.body_shadowing import BodyShadowing
-from radiotwin.effects.catalogue.clock_offset import ReceiverClockOffset
-from radiotwin.effects.catalogue.detection_limit import DetectionLimit
-from radiotwin.effects.catalogue.excess_attenuation import ExcessAttenuation
-from radiotwin.effects.catalogue.foliage import Foliage
-from radiotwin.effects.catalogue.gain_drift import DeviceDrift, ReceiverDrift
-from radiotwin.effects.catalogue.gain_offsets import DeviceGainOffset, ReceiverGainOffset
-from radiotwin.effects.catalogue.interference import Interference
-from radiotwin.effects.catalogue.lock_loss import LockLoss
-from radiotwin.effects.catalogue.missing_obstacle import MissingObstacle
-from radiotwin.effects.catalogue.noise_floor import NoiseFloor
-from radiotwin.effects.catalogue.path_strength import WallReflection
-from radiotwin.effects.catalogue.position_errors import DevicePositionError, ReceiverPositionError
-from radiotwin.effects.catalogue.receiver_saturation import ReceiverSaturation
-from radiotwin.effects.catalogue.removed_obstacle import RemovedObstacle
-from radiotwin.effects.catalogue.sector_antenna import SectorAntenna
-from radiotwin.effects.catalogue.tilted_dipole import TiltedDipole
+from radiotwin.effects import registry
 from radiotwin.links.measurements import Measurements
 from radiotwin.report.closeloop_data import bin_index, bin_means, collect
 from radiotwin.report.closeloop_figures import (
@@ -70,7 +54,7 @@ def loop():
     receiver_m = np.column_stack([100 + 10 * slot + 30 * flight, 60.0 * flight + 5 * slot, 50.0 + 10 * receiver])
     device_m = np.array([(0, 0, 1.5), (400, 50, 1.5), (200, 350, 1.5)])
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("radiotwin.closeloop.run.catalogue", lambda: (ReceiverGainOffset,))  # the others take long
+        patch.setattr("radiotwin.closeloop.run.catalogue", lambda: (registry.ReceiverGainOffset,))  # the others take long
         return close_loop(measured(device_m, receiver_m, index, -6.0), base="log-distance")
 
 
@@ -128,29 +112,29 @@ def test_figures_where_nothing_was_found_and_nothing_could_be_tested(loop, tmp_p
 
 
 @pytest.mark.parametrize("effect, params", [
-    (DeviceGainOffset, {"members": [0, 1, 2], "offsets_sd_db": 4.0}), (ExcessAttenuation, {"scale_height_m": 100.0}),
-    (BodyShadowing, {"receivers": {"0": {"depth_db": 8.0, "azimuth_deg": 60.0}, "1": {"depth_db": 3.0}}}),
-    (ReceiverDrift, {"receivers": {"0": ["warm_up_each_flight", 8.0], "1": ["step", 150.0]}}),
-    (DeviceDrift, {"devices": {"1": ["step", 150.0]}, "span_s": [0.0, 300.0]}),
-    (ReceiverClockOffset, {"receiver": 0, "offset_s": 3.0, "speed_m_s": 10.0}),
-    (ReceiverSaturation, {"receivers": {"0": [-85.0, 1.0]}}), (NoiseFloor, {"receivers": {"1": -95.0}}),
-    (SectorAntenna, {"devices": {"1": {"azimuth_deg": 30.0, "front_to_back_db": 15.0}}}),
-    (TiltedDipole, {"receivers": {"0": {"tilt_deg": 20.0, "lean_azimuth_deg": 90.0}}}),
-    (DevicePositionError, {"device": 1, "move_m": [30.0, -20.0]}),
-    (ReceiverPositionError, {"receiver": 0, "move_m": [0.0, 0.0, 30.0]}),
-    (MissingObstacle, {"box": [250.0, 120.0, 30.0, 20.0, 60.0, 20.0], "scattered_db": 0.0}),
-    (MissingObstacle, {"box": [-900.0, 0.0, 30.0, 20.0, 60.0, 20.0], "scattered_db": 0.0}),  # in no link's way
-    (Interference, {"place_m": [150.0, 200.0], "level_db": -80.0, "within_m": [0.0, 0.0, 500.0, 500.0]}),
-    (DetectionLimit, {"receivers": {"0": -95.0}}),
-    (LockLoss, {"receivers": {"0": 0.1, "1": 0.02}}),
-    (Foliage, {"box": [250.0, 120.0, 30.0, 20.0, 20.0, 20.0], "law": [0.6, 15.0]})])
+    (registry.DeviceGainOffset, {"members": [0, 1, 2], "offsets_sd_db": 4.0}), (registry.ExcessAttenuation, {"scale_height_m": 100.0}),
+    (registry.BodyShadowing, {"receivers": {"0": {"depth_db": 8.0, "azimuth_deg": 60.0}, "1": {"depth_db": 3.0}}}),
+    (registry.ReceiverDrift, {"receivers": {"0": ["warm_up_each_flight", 8.0], "1": ["step", 150.0]}}),
+    (registry.DeviceDrift, {"devices": {"1": ["step", 150.0]}, "span_s": [0.0, 300.0]}),
+    (registry.ReceiverClockOffset, {"receiver": 0, "offset_s": 3.0, "speed_m_s": 10.0}),
+    (registry.ReceiverSaturation, {"receivers": {"0": [-85.0, 1.0]}}), (registry.NoiseFloor, {"receivers": {"1": -95.0}}),
+    (registry.SectorAntenna, {"devices": {"1": {"azimuth_deg": 30.0, "front_to_back_db": 15.0}}}),
+    (registry.TiltedDipole, {"receivers": {"0": {"tilt_deg": 20.0, "lean_azimuth_deg": 90.0}}}),
+    (registry.DevicePositionError, {"device": 1, "move_m": [30.0, -20.0]}),
+    (registry.ReceiverPositionError, {"receiver": 0, "move_m": [0.0, 0.0, 30.0]}),
+    (registry.MissingObstacle, {"box": [250.0, 120.0, 30.0, 20.0, 60.0, 20.0], "scattered_db": 0.0}),
+    (registry.MissingObstacle, {"box": [-900.0, 0.0, 30.0, 20.0, 60.0, 20.0], "scattered_db": 0.0}),  # in no link's way
+    (registry.Interference, {"place_m": [150.0, 200.0], "level_db": -80.0, "within_m": [0.0, 0.0, 500.0, 500.0]}),
+    (registry.DetectionLimit, {"receivers": {"0": -95.0}}),
+    (registry.LockLoss, {"receivers": {"0": 0.1, "1": 0.02}}),
+    (registry.Foliage, {"box": [250.0, 120.0, 30.0, 20.0, 20.0, 20.0], "law": [0.6, 15.0]})])
 def test_an_effect_is_drawn_in_its_own_terms(loop, tmp_path, effect, params):
     changed = with_model(loop, with_effect(loop.before, effect, params))
     save(drawn(changed), tmp_path / "effect.png")
     assert (tmp_path / "effect.png").stat().st_size > 5000
 
 
-class OwnEffect(ExcessAttenuation):
+class OwnEffect(registry.ExcessAttenuation):
     """An effect that the report does not know."""
 
     name = "own_effect"
@@ -175,8 +159,8 @@ def test_effects_of_the_map_are_drawn_on_it(small_scene, tmp_path):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("radiotwin.closeloop.run.catalogue", tuple)
         loop = close_loop(data, small_scene, "log-distance")
-    for effect, params in ((RemovedObstacle, {"building": 0, "centre_m": [0.0, 0.0, 9.0]}),
-                            (WallReflection, {"strength_db": 0.0, "level_db": 0.0})):
+    for effect, params in ((registry.RemovedObstacle, {"building": 0, "centre_m": [0.0, 0.0, 9.0]}),
+                            (registry.WallReflection, {"strength_db": 0.0, "level_db": 0.0})):
         changed = with_model(loop, with_effect(loop.before, effect, params))
         data = collect(changed)
         place = {"family": "place", "members": {"device": data.links.device_names[1:2]}, "ranges": {"x_m": [25.0, 50.0], "y_m": [0.0, 25.0]}}
