@@ -18,12 +18,8 @@ def keep_out(scene: Scene, areas: Sequence[BaseGeometry], clearance_m: float) ->
     """Return the mask (nz, ny, nx) of lattice positions that are closed to UAVs.
 
     A position is closed if any part of its cell is; the insides of buildings are added by the
-    mission.
-
-    Args:
-        scene: scene with lattice and buildings.
-        areas: no-fly areas in the local frame, at all heights.
-        clearance_m: distance to keep from buildings, sideways and above them [m].
+    mission. Closed are no-fly `areas` in the local frame, at all heights, and what is nearer to a
+    building than `clearance_m`, sideways and above it.
     """
     lattice = scene.lattice
     blocked = np.zeros(lattice.shape, dtype=bool)  # a mission adds the insides of buildings

@@ -24,7 +24,7 @@ from marl.environment import Environment
 from marl.flights import Flights, Policy, evaluate, fly
 from marl.heuristics import HeuristicPolicy, waypoint_actions
 from marl.learner import Learner, make_learner
-from marl.mission import Known, Mission, make_mission
+from marl.mission import Known, Mission, levels_of, make_mission
 from marl.planner import PlanPolicy
 from marl.settings import LearnerSettings, RunSettings, stream
 from marl.worlds import twin_prior
@@ -47,30 +47,11 @@ NUMBERS = ("real_ratio", "truth_ratio", "truth_ratio_std", "twin_ratio", "locati
 MAX_NUMBER = 1e30  # largest number that is accepted in a log
 
 
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """Result of a run.
-
-    Attributes:
-        rows: log with a row for each round; `docs/marl.md` explains the columns.
-        blocks: records of training, several for each round.
-        flights: final evaluation in the truth.
-        known: device positions that the UAVs knew in it.
-        twin: the last twin; None if training was in the truth.
-    """
-
-    rows: list[dict]
-    blocks: list[dict]
-    flights: Flights
-    known: Known
-    twin: Twin | None
-
-
 def run_algorithm(run: RunSettings, learner_settings: LearnerSettings, scene: Scene,
                   truth: RadioMap, folder: Path | None, resume: bool,
                   on_round: Callable[[list[dict], list[dict]], None],
                   on_progress: Callable[..., None], device: str = "cpu",
-                  on_learned: Callable[["Campaign", Mission], None] | None = None) -> Outcome:
+                  on_learned: Callable[["Campaign", Mission], None] | None = None) -> "Campaign":
     """Alternate real flights and training in the twin.
 
     With a perfect twin (`run.twin == "truth"`) nothing is measured: training episodes are real.
@@ -89,19 +70,20 @@ def run_algorithm(run: RunSettings, learner_settings: LearnerSettings, scene: Sc
         on_learned: called in every round with the campaign and the mission to train in.
 
     Returns:
-        the result; on the CPU it is the same to the bit if the run was interrupted and resumed.
+        the campaign at its end; on the CPU it is the same to the bit if the run was interrupted and
+        resumed.
 
     Raises:
         BadInput: a damaged checkpoint, or input that `fit_twin` or `make_mission` refuses.
     """
     campaign = Campaign(run, scene, truth)
     learner = make_learner(run, learner_settings, campaign.in_truth(), run.real_episodes, device)
-    rows, blocks = campaign.rows, list[dict]()
+    rows, blocks = campaign.rows, campaign.blocks
     checkpoint = folder / NAME if folder else None
     try:
         # A run that was stopped before its first checkpoint starts again.
         if resume and folder and checkpoint and checkpoint.exists():
-            blocks += resumed(campaign, learner, checkpoint)
+            resume_from(checkpoint, campaign, learner)
             if campaign.twin is not None:
                 campaign.twin.save(folder / "twin")
             on_progress(run.episodes * len(rows), _summary(rows[-1], run))
@@ -127,15 +109,15 @@ def run_algorithm(run: RunSettings, learner_settings: LearnerSettings, scene: Sc
                                 checkpoint)
             on_round(rows, blocks)
         policy = learner.policy(stream(run.seed, "decisions", run.real_episodes - 1))
-        flights = evaluate(campaign.in_truth(), policy, run.flights,
-                           stream(run.seed, "truth evaluation"))
-        return Outcome(rows, blocks, flights, campaign.known, campaign.twin)
+        campaign.flights = evaluate(campaign.in_truth(), policy, run.flights,
+                                    stream(run.seed, "truth evaluation"))
+        return campaign
     finally:
         learner.close()
 
 
-def resumed(campaign: "Campaign", learner: Learner, path: Path) -> list[dict]:
-    """Restore a campaign and its learner from a checkpoint; return the records of training.
+def resume_from(path: Path, campaign: "Campaign", learner: Learner) -> None:
+    """Restore a campaign and its learner from a checkpoint.
 
     Raises:
         BadInput: the checkpoint is damaged, or of another run.
@@ -146,11 +128,10 @@ def resumed(campaign: "Campaign", learner: Learner, path: Path) -> list[dict]:
         if not campaign.rows:
             raise Damaged("no round has finished")
         learner.load_state(state["strategy"])
-        blocks = require_log(state["blocks"], ("round", "episodes"))
+        campaign.blocks += require_log(state["blocks"], ("round", "episodes"))
     if not state["strategy"]:  # a learner without a state of its own is prepared from the twin
         campaign.pass_uncertainty(learner)
         learner.prepare(campaign.mission(), lambda _: None)
-    return blocks
 
 
 class Campaign:
@@ -166,13 +147,16 @@ class Campaign:
         known: device positions that the UAVs know.
         twin: the present twin; None before the first, or if training is in the truth.
         rows: log with a row for each round; `docs/marl.md` explains the columns.
+        blocks: records of training, several for each round.
+        flights: final evaluation in the truth.
         learn_s: duration of the last fit of a twin [s].
     """
 
     def __init__(self, run: RunSettings, scene: Scene, truth: RadioMap | None,
                  measured: Measurements | None = None) -> None:
         self.run, self.scene, self.measured = run, scene, measured
-        self.rows: list[dict] = []
+        self.rows, self.blocks = list[dict](), list[dict]()
+        self.flights: Flights
         self.twin: Twin | None = None
         self.reality: Reality | None = None
         if truth is not None:
@@ -197,7 +181,10 @@ class Campaign:
         """Return the mission to train in: in the twin's map, or in the truth's without a twin."""
         if self.twin is None:
             return self.in_truth()
-        return twin_mission(self.scene, self.run, self.twin, self.known)
+        radio_map = self.twin.radio_map(self.scene)
+        if self.run.twin_shadowing == "fitted":
+            radio_map = with_shadowing(radio_map, self.twin)
+        return make_mission(self.scene, radio_map, self.known, self.run.assignment)
 
     def pass_uncertainty(self, learner: Learner) -> None:
         """Pass the twin's uncertainty to a learner that uses it (`Learner.believes`)."""
@@ -212,20 +199,18 @@ class Campaign:
     def learn(self, learner: Learner | None, rng: np.random.Generator) -> None:
         """Fly a real episode, and fit the twin to all measurements so far.
 
-        Measurements from a file are fitted once. If the truth is the twin, nothing is done.
-
-        Args:
-            learner: learner whose policy may fly; None if measurements were given.
-            rng: generator of the policy's decisions.
+        Measurements from a file are fitted once; then no learner is needed. If the truth is the
+        twin, nothing is done.
         """
-        run, started = self.run, time.perf_counter()
-        if run.twin == "truth" or (self.measured is not None and self.twin is not None):
+        run, started, measured = self.run, time.perf_counter(), self.measured
+        if run.twin == "truth" or (measured is not None and self.twin is not None):
             return
-        if self.measured is None:
+        if measured is None:
             assert self.reality is not None and learner is not None
             self.reality.fly(measuring_policy(run, self.reality, self.twin, self.known, learner,
                                               rng), self.known)
-        self._see(fit_twin(self._measurements(), self.scene, model=TWINS[run.twin], seed=run.seed,
+            measured = self.reality.measurements()
+        self._see(fit_twin(measured, self.scene, model=TWINS[run.twin], seed=run.seed,
                            start=self.twin))
         self.learn_s = time.perf_counter() - started
 
@@ -233,11 +218,8 @@ class Campaign:
             simulated: int) -> None:
         """Evaluate the policy in the twin's and the truth's map, if any, and add a row to the log.
 
-        Args:
-            learner: learner that was prepared in this round.
-            mission: mission in which it was prepared.
-            rng: generator of the policy's decisions.
-            simulated: training episodes of all replicas so far.
+        `mission` is that in which the learner was prepared in this round, `simulated` the number of
+        training episodes of all replicas so far.
         """
         run, found, in_twin, real = self.run, self.known, np.full(1, np.nan), np.full(1, np.nan)
         if self.twin is not None:
@@ -291,10 +273,7 @@ class Campaign:
     def load_state(self, state: dict, path: Path, others: Collection[str]) -> None:
         """Restore the campaign from a checkpoint; raise Damaged if it is not of this campaign.
 
-        Args:
-            state: content of the checkpoint, which may come from a stranger.
-            path: path of the checkpoint.
-            others: names of the parts that the caller checks.
+        The state may come from a stranger; the caller checks its parts `others`.
         """
         require(state, dict.fromkeys(("rows", "tables", "ratios", "twin", *others), ...))
         run, tables, ratios = self.run, state["tables"], [float(each) for each in state["ratios"]]
@@ -311,13 +290,6 @@ class Campaign:
             self.reality.ratios += ratios
         if state["twin"] is not None:
             self._see(stored_twin(state["twin"], path, self.scene))
-
-    def _measurements(self) -> Measurements:
-        """Return the given measurements, or those of the simulated flights so far."""
-        if self.measured is not None:
-            return self.measured
-        assert self.reality is not None
-        return self.reality.measurements()
 
     def _see(self, twin: Twin) -> None:
         """Set the twin, and the device positions that the UAVs know by it."""
@@ -374,10 +346,9 @@ class Reality:
         before = len(self.tables) * flights.action.shape[1]
         time_s = config.mission.slot_s * (np.arange(slots) + before)
         tables = []
-        for u, uav in enumerate(config.uavs):
+        for u, (uav, level) in enumerate(zip(config.uavs, levels_of(self.scene))):
             flown = slice(0, max(int((frames.battery[0, :slots, u] > 0).sum()), 1))
             cells = frames.cell[0, flown, u].astype(int)
-            level = int(np.abs(lattice.z_m - uav.altitude_m).argmin())
             index = np.ravel_multi_index((np.full(len(cells), level), cells[:, 0], cells[:, 1]),
                                          lattice.shape)
             snr_db = frames.snr_db[0, flown, u].T.astype(float)
@@ -387,21 +358,6 @@ class Reality:
             tables.append(link_table(self.scene, name, uav.uav, index, gain_db, time_s[flown],
                                      heading_deg(cells)))
         return pd.concat(tables, ignore_index=True)
-
-
-def twin_mission(scene: Scene, run: RunSettings, twin: Twin, known: Known) -> Mission:
-    """Return the mission in a twin's map.
-
-    Args:
-        scene: scene of the twin.
-        run: settings of the run; `twin_shadowing` tells how long errors of the map last.
-        twin: the twin.
-        known: device positions that the UAVs know.
-    """
-    radio_map = twin.radio_map(scene)
-    if run.twin_shadowing == "fitted":
-        radio_map = with_shadowing(radio_map, twin)
-    return make_mission(scene, radio_map, known, run.assignment)
 
 
 def location_errors_m(scene: Scene, known: Known) -> np.ndarray:

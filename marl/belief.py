@@ -80,9 +80,7 @@ class _State(NamedTuple):
 class Belief:
     """Belief of one UAV, or of UAVs that share readings, during one flight.
 
-    Args:
-        prior: prior before take-off.
-        mission: the mission as the UAVs assume it.
+    `mission` is that which the UAVs assume.
     """
 
     def __init__(self, prior: Prior, mission: Mission) -> None:
@@ -101,13 +99,7 @@ class Belief:
         self._table = _expected_table(mission)
 
     def hear(self, uav: int, cell: np.ndarray, snr_db: np.ndarray) -> None:
-        """Update the belief by a UAV's readings of all devices in a slot.
-
-        Args:
-            uav: number of the UAV.
-            cell: (2,) row and column of the UAV.
-            snr_db: (K,) SNR [dB]; -inf if a device is not detected.
-        """
+        """Update the belief by a UAV's readings (K,) [dB] in a cell; -inf: not detected."""
         moved_m = self._mission.step_m * float(np.hypot(*(cell - self._cell[uav])))
         kept = math.exp(-moved_m / self.prior.length_m)
         _hear(self.prior, self._state, uav, int(self._mission.level[uav]), int(cell[0]),
@@ -153,18 +145,10 @@ def _expected_table(mission: Mission) -> np.ndarray:
 @njit(cache=True, nogil=True, error_model="numpy")
 def _hear(prior: Prior, state: _State, uav: int, level: int, row: int, column: int, kept: float,
           snr_db: np.ndarray, limit_db: float) -> None:
-    """Update the Kalman filters of all candidate positions by a UAV's readings of K devices.
+    """Update the Kalman filters of all candidate positions in `state` by a UAV's readings.
 
-    Args:
-        prior: prior of the belief.
-        state: state of the filter; changed.
-        uav: number of the UAV.
-        level: level of its map.
-        row: row of its cell.
-        column: column of its cell.
-        kept: correlation of the map's error here with that at the UAV's last cell.
-        snr_db: (K,) readings; -inf = not detected.
-        limit_db: limit of detection [dB].
+    `kept` is the correlation of the map's error here with that at the UAV's last cell, `snr_db`
+    (K,) the readings, -inf if not detected, and `limit_db` the limit of detection.
     """
     devices, candidates, errors = state.mean.shape
     at, lasting = uav + 1, math.sqrt(prior.share)

@@ -194,13 +194,10 @@ def require(value: Any, form: Any, what: str = "the state") -> Any:
 
 def require_log(records: Any, counts: Collection[str], others: Collection[str] = (),
                 largest: float = math.inf) -> list[dict]:
-    """Return the records of a log if they are valid; raise Damaged otherwise.
+    """Return the records of a log, name -> number, if they are valid; raise Damaged otherwise.
 
-    Args:
-        records: list of dicts name -> number; further names are allowed.
-        counts: names of required whole numbers.
-        others: names of other required numbers.
-        largest: largest absolute value; NaN is allowed.
+    `counts` are required whole numbers, `others` required numbers of at most `largest`, or NaN.
+    Further names are allowed.
     """
     if not isinstance(records, list):
         raise Damaged("a log should be a list")

@@ -174,15 +174,9 @@ class CorrelatedField:
 @njit(cache=True, nogil=True)
 def feasible(mission: Mission, uav: int, row: int, column: int, battery: int,
              out: np.ndarray) -> None:
-    """Compute the safe actions (paper, Sec. II-A): on the map, with battery enough to fly home.
+    """Write the safe actions (paper, Sec. II-A) to `out` (6,): on the map, with a way home.
 
-    Args:
-        mission: the mission.
-        uav: number of the UAV.
-        row: row of its cell.
-        column: column of its cell.
-        battery: battery left [hovers]; if it is empty, only the no-op is feasible.
-        out: (6,) bool, overwritten.
+    With an empty battery only the no-op is feasible.
     """
     ny, nx = mission.steps_home.shape[1:]
     move_cost = COSTS[1]
@@ -215,10 +209,8 @@ def rate(snr_db: float, rate_scale: float) -> float:
 def assign(strength: np.ndarray, max_rate: bool, assigned: np.ndarray) -> None:
     """Assign at most one device to each UAV, and one UAV to each device (paper, Eq. 7 and 8).
 
-    Args:
-        strength: (U, K) strength of each link, -inf = not usable; overwritten.
-        max_rate: whether a UAV that loses its best device gets none, not its next best.
-        assigned: (U,) device or -1, overwritten.
+    `strength` (U, K), -inf if not usable, is overwritten, and so is `assigned` (U,), -1 for none.
+    With `max_rate` a UAV that loses its best device gets none, not its next best.
     """
     assigned[:] = -1
     for first in range(len(strength)):

@@ -38,12 +38,7 @@ def trajectories_figure(scene: Scene, mission: Mission, flights: Flights, flight
                         known: Known | None) -> Figure:
     """Draw the trajectories of one flight over the city, with a panel for each UAV.
 
-    Args:
-        scene: scene with the true device positions.
-        mission: mission that was flown.
-        flights: record of flights.
-        flight: index of the flight.
-        known: device positions that the UAVs knew; None: the scene's.
+    `known` are device positions that the UAVs knew; None: they are not drawn.
     """
     x_min, x_max, y_min, y_max = scene.config.extent.bounds
     width_in = 5.6 * min(max((x_max - x_min) / (y_max - y_min), 0.6), 1.6)
@@ -112,12 +107,7 @@ def curve_figure(curves: dict[str, list[dict]], levels: dict[str, float]) -> Fig
 
 
 class FlightPicture:
-    """Picture of a flight over the city from above, redrawn for each slot.
-
-    Args:
-        scene: scene with the true device positions.
-        mission: mission that is flown.
-    """
+    """Picture of a flight over the city from above, redrawn for each slot."""
 
     def __init__(self, scene: Scene, mission: Mission) -> None:
         x_min, x_max, y_min, y_max = scene.config.extent.bounds
@@ -141,13 +131,7 @@ class FlightPicture:
     def image(self, cells: np.ndarray, assigned: np.ndarray, data_units: np.ndarray) -> np.ndarray:
         """Draw a slot: devices scaled by their data, UAVs in the colour of the assigned device.
 
-        Args:
-            cells: (T, U, 2) cells (row, column) in the slots so far.
-            assigned: (U,) device assigned to each UAV, -1 for none.
-            data_units: (K,) data left at each device.
-
-        Returns:
-            (height, width, 3) uint8 image.
+        `cells` (T, U, 2) are those of the slots so far; the image is (height, width, 3) uint8.
         """
         lattice, step_m = self._scene.lattice, self._mission.step_m
         for u, (trail, uav) in enumerate(zip(self._trails, self._uavs)):
@@ -188,11 +172,9 @@ def _device_colours(count: int) -> list:
 def _collected_by_device(flights: Flights, flight: int, mission: Mission) -> np.ndarray:
     """Return the data units (U, K) that each UAV collected from each device in a flight."""
     collected = np.zeros((mission.uavs, mission.devices))
-    for slot in range(flights.length[flight]):
-        for u in range(mission.uavs):
-            served = flights.frames.assigned[flight, slot, u]
-            if served >= 0:
-                collected[u, served] += flights.collected[flight, slot, u]
+    served = flights.frames.assigned[flight]
+    slot, u = np.nonzero(served >= 0)
+    np.add.at(collected, (u, served[slot, u]), flights.collected[flight, slot, u])
     return collected
 
 

@@ -74,9 +74,7 @@ def evaluate(mission: Mission, policy: Policy, flights: int, rng: np.random.Gene
 def track_table(scene: Scene, mission: Mission, flights: Flights, flight: int) -> pd.DataFrame:
     """Return one flight as a table with a row for each UAV and slot until its battery is empty.
 
-    Returns:
-        columns flight, uav, time_s, x_m, y_m, z_m, device (assigned to the UAV, empty for none),
-        collected [data units].
+    The column device is the one assigned to the UAV, empty for none.
     """
     parts, frames = [], flights.frames
     names = np.array([device.device for device in scene.config.devices] + [""])

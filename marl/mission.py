@@ -218,7 +218,8 @@ def _check(scene: Scene, radio_map: RadioMap, assignment: str) -> None:
     attributes = radio_map.dataset.attrs
     share, length_m = (attributes.get(name, 1.0)
                        for name in ("shadowing_share", "shadowing_length_m"))
-    if not (_number(share) and 0 <= share <= 1 and _number(length_m) and 0 < length_m < np.inf):
+    if not (all(isinstance(each, int | float | np.number) for each in (share, length_m))
+            and 0 <= share <= 1 and 0 < length_m < np.inf):
         raise BadInput(f"the radio map's attributes shadowing_share = {share}, shadowing_length_m "
                        f"= {length_m}: allowed are a share from 0 to 1 and a length above 0; make "
                        "the map again")
@@ -230,10 +231,6 @@ def _check_values(device: str, name: str, values: np.ndarray, low: float, high: 
     if len(wrong):
         raise BadInput(f"the radio map's {name} of {device} is {wrong[0]:g} somewhere; allowed are "
                        f"{low:g} to {high:g} dB; make the map again")
-
-
-def _number(value: object) -> bool:
-    return isinstance(value, int | float | np.number)
 
 
 def _ends(scene: Scene, uav: UavConfig, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -81,11 +81,7 @@ def plan_flights(twin: Twin, scene: Scene, settings: PlanSettings,
                  on_progress: Callable[..., None] = lambda *_: None) -> PlannedFlights:
     """Plan flights over a twin's map, and predict the share of data that they collect.
 
-    Args:
-        twin: twin with device positions and errors.
-        scene: scene with buildings, lattice and UAVs.
-        settings: settings of the plan.
-        on_progress: called with the per cent of the work done since the last call, and with a text.
+    `on_progress` is called with the per cent of the work done since the last call, and with a text.
 
     Raises:
         BadInput: no UAV, a battery that does not reach the terminal, a blocked base, an unusable

@@ -39,17 +39,7 @@ def routes(scene: Scene, mission: Mission, actions: np.ndarray) -> list[Route]:
 
 
 def write_plan(folder: Path, planned: PlannedFlights, wanted: float, facts: dict) -> list[str]:
-    """Write the folder of a plan.
-
-    Args:
-        folder: existing folder.
-        planned: the plan.
-        wanted: wanted share of the data.
-        facts: further entries of `plan.json`.
-
-    Returns:
-        Names of the files.
-    """
+    """Write a plan to a folder, with more `facts` in `plan.json`; return the names of the files."""
     scene, mission, promised = planned.scene, planned.mission, planned.promised
     found = routes(scene, mission, promised.plan.actions)
     flights = [{"uav": each.name, "time_s": round(float(each.arrival_s[-1] + each.hold_s[-1]), 1),

@@ -48,25 +48,23 @@ class Plan(NamedTuple):
 
 
 class TourFlight(NamedTuple):
-    """State of U UAVs that follow tours, and scratch arrays.
+    """Expected flight of U UAVs along tours: the state at the beginning of each of T slots.
 
     Attributes:
-        cell: (U, 2) int64 row and column.
-        battery: (U,) int64 left [hovers].
-        left: (K,) expected data units left at each device.
-        reached: (U,) int64 number of waypoints that each UAV has passed.
-        hovered: (U,) int64 hovers done at the next waypoint.
-        strength, assigned, mask: (U, K), (U,) and (6,) scratch.
+        action: (T - 1, U) int8.
+        cell: (T, U, 2) int64 row and column.
+        battery: (T, U) int64 left [hovers].
+        left: (T, K) expected data units left at each device.
+        reached: (T, U) int64 number of waypoints that each UAV has passed.
+        hovered: (T, U) int64 hovers done at the next waypoint.
     """
 
+    action: np.ndarray
     cell: np.ndarray
     battery: np.ndarray
     left: np.ndarray
     reached: np.ndarray
     hovered: np.ndarray
-    strength: np.ndarray
-    assigned: np.ndarray
-    mask: np.ndarray
 
 
 class Candidates(NamedTuple):
@@ -123,6 +121,35 @@ class Course(NamedTuple):
         return cls(np.full((slots, uavs), -1, np.int32), np.zeros((uavs, slots), np.int32),
                    np.zeros((uavs, waypoints + 1), np.int32), np.full((slots, uavs), -1, np.int32),
                    np.zeros((slots, uavs)), mission.data_units.copy())
+
+
+class Search(NamedTuple):
+    """Tours that are annealed, and their flight.
+
+    Attributes:
+        tour, count: present tours, see `Plan`.
+        best_tour, best_count: the best so far.
+        share: (2,) share of the data that the present tours collect, and the best.
+        course: simulated flight of the present tours.
+        trial: the same, for changed tours.
+    """
+
+    tour: np.ndarray
+    count: np.ndarray
+    best_tour: np.ndarray
+    best_count: np.ndarray
+    share: np.ndarray
+    course: Course
+    trial: Course
+
+    @classmethod
+    def of(cls, mission: Mission, candidates: Candidates, tour: np.ndarray, count: np.ndarray,
+           ) -> "Search":
+        """Return a search that begins with tours (U, W, 3) and (U,), which it does not change."""
+        course = Course.of(mission, tour.shape[1])
+        share = _fly_tours(mission, candidates, tour, count, course)
+        return cls(tour.copy(), count.copy(), tour.copy(), count.copy(), np.full(2, share), course,
+                   Course(*(array.copy() for array in course)))
 
 
 class PlanPolicy:
@@ -192,9 +219,8 @@ def plan(mission: Mission, iterations: int, seed: int, value: np.ndarray | None 
     tries = np.diff(np.round(iterations * np.cumsum([0.0, *shares])).astype(int))
     with progress("planning", total=iterations) as advance:
         def search(tries: int, tour: np.ndarray, count: np.ndarray, temperature: float) -> Plan:
-            return improve(mission, candidates.value, tour, count, tries, rng,
-                           temperature=temperature / mission.devices, on_progress=advance,
-                           candidates=candidates)
+            return improve(mission, candidates, tour, count, tries, rng,
+                           temperature=temperature / mission.devices, on_progress=advance)
 
         best = max((search(each, *nothing, START_TEMPERATURE) for each in tries[:starts]),
                    key=attrgetter("ratio"))
@@ -204,44 +230,33 @@ def plan(mission: Mission, iterations: int, seed: int, value: np.ndarray | None 
     return best
 
 
-def improve(mission: Mission, value: np.ndarray, tour: np.ndarray, count: np.ndarray,
-            iterations: int, rng: np.random.Generator, *, only: int = -1,
-            temperature: float = START_TEMPERATURE / 10,
-            on_progress: Callable[[int], None] = lambda _: None,
-            candidates: Candidates | None = None) -> Plan:
+def improve(mission: Mission, candidates: Candidates, tour: np.ndarray, count: np.ndarray,
+            iterations: int, rng: np.random.Generator, *, temperature: float, only: int = -1,
+            on_progress: Callable[[int], None] = lambda _: None) -> Plan:
     """Improve tours by simulated annealing.
 
     Args:
         mission: present cells and batteries of the UAVs, and data left at the devices.
-        value: (L, K, ny, nx) expected data units a slot, see `expected_data`.
+        candidates: devices in reach of each cell.
         tour: tours to start from, see `Plan`; not changed.
         count: visits, see `Plan`; not changed.
         iterations: number of plans to try.
         rng: generator of the search.
-        only: the only UAV whose tour is changed; -1: all.
         temperature: initial temperature [collected share].
+        only: the only UAV whose tour is changed; -1: all.
         on_progress: called with the number of plans tried since the last call.
-        candidates: lists of an earlier search with the same value; None: new ones.
     """
-    tour, count = tour.copy(), count.copy()
-    best_tour, best_count = tour.copy(), count.copy()
-    candidates = Candidates.of(value) if candidates is None else candidates
-    course = Course.of(mission, tour.shape[1])
-    score = best = _fly_tours(mission, candidates, tour, count, course)
-    trial = Course(*(array.copy() for array in course))
+    search = Search.of(mission, candidates, tour, count)
     for start in range(0, iterations, CHUNK):
-        if best == 1.0:
+        if search.share[1] == 1.0:
             break
         stop = min(start + CHUNK, iterations)
-        score, best = _anneal(mission, candidates, tour, count, only, temperature, score,
-                              best_tour, best_count, best, np.arange(start, stop) / iterations,
-                              course, trial, rng)
+        _anneal(mission, candidates, search, only, temperature,
+                np.arange(start, stop) / iterations, rng)
         on_progress(stop - start)
-    actions = np.full((mission.longest, mission.uavs), NO_OP, dtype=np.int8)
-    flight = take_off(mission, mission.devices)
-    fly_on(mission, value, best_tour, best_count, flight, actions)
-    ratio = 1.0 - flight.left.sum() / mission.data_units.sum()
-    return Plan(actions, float(ratio), best_tour, best_count)
+    flight = expected_flight(mission, candidates.value, search.best_tour, search.best_count)
+    ratio = 1.0 - flight.left[-1].sum() / mission.data_units.sum()
+    return Plan(flight.action, float(ratio), search.best_tour, search.best_count)
 
 
 def expected_data(mission: Mission) -> np.ndarray:
@@ -285,25 +300,11 @@ def _move_towards_cell(row: int, column: int, to_row: int, to_column: int,
 @njit(cache=True, nogil=True, error_model="numpy")
 def next_action(mission: Mission, uav: int, row: int, column: int, battery: int, tour: np.ndarray,
                 count: int, reached: int, hovered: int, mask: np.ndarray) -> tuple[int, int, int]:
-    """Return the next action of a UAV that follows a tour.
+    """Return the next action of a UAV that follows a tour, and the new `reached` and `hovered`.
 
     At the tour's end, or if the next waypoint is infeasible, the UAV hovers while it can, then
-    flies home.
-
-    Args:
-        mission: mission of the UAV.
-        uav: its number.
-        row: row of its cell.
-        column: column of its cell.
-        battery: battery left [hovers].
-        tour: (W, 3) waypoints (row, column, hovers).
-        count: number of waypoints.
-        reached: number of waypoints passed.
-        hovered: hovers done at the next waypoint.
-        mask: (6,) scratch.
-
-    Returns:
-        action, and the new `reached` and `hovered`.
+    flies home. It has passed `reached` of the `count` waypoints of `tour` (W, 3), and hovered
+    `hovered` slots at the next one; `mask` (6,) is scratch.
     """
     feasible(mission, uav, row, column, battery, mask)
     while reached < count:
@@ -328,22 +329,23 @@ def next_action(mission: Mission, uav: int, row: int, column: int, battery: int,
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def take_off(mission: Mission, devices: int) -> TourFlight:
-    """Return the state before the first slot: UAVs at their starts, all data at the devices."""
-    uavs = len(mission.battery)
-    return TourFlight(mission.start.copy(), mission.battery.copy(), mission.data_units.copy(),
-                      np.zeros(uavs, np.int64), np.zeros(uavs, np.int64),
-                      np.empty((uavs, devices)), np.empty(uavs, np.int16),
-                      np.empty(ACTION_COUNT, np.bool_))
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def fly_on(mission: Mission, value: np.ndarray, tour: np.ndarray, count: np.ndarray,
-           flight: TourFlight, actions: np.ndarray) -> None:
-    """Fly T slots along tours, with expected data; update `flight` and write `actions` (T, U)."""
-    cell, battery, left, reached, hovered, strength, assigned, mask = flight
-    uavs, devices = strength.shape
-    for slot in range(len(actions)):
+def expected_flight(mission: Mission, value: np.ndarray, tour: np.ndarray, count: np.ndarray,
+                    ) -> TourFlight:
+    """Fly tours from take-off; a slot yields its expected data `value` (L, K, ny, nx)."""
+    slots, uavs, devices = mission.battery.max(), len(tour), value.shape[1]
+    actions = np.full((slots, uavs), NO_OP, np.int8)
+    cells, lefts = np.empty((slots + 1, uavs, 2), np.int64), np.empty((slots + 1, devices))
+    batteries = np.empty((slots + 1, uavs), np.int64)
+    passed, hovers = np.zeros((slots + 1, uavs), np.int64), np.zeros((slots + 1, uavs), np.int64)
+    cells[0], batteries[0], lefts[0] = mission.start, mission.battery, mission.data_units
+    strength, assigned = np.empty((uavs, devices)), np.empty(uavs, np.int16)
+    mask = np.empty(ACTION_COUNT, np.bool_)
+    for slot in range(slots):
+        for state in (batteries, passed, hovers):
+            state[slot + 1] = state[slot]
+        cells[slot + 1], lefts[slot + 1] = cells[slot], lefts[slot]
+        cell, battery, left = cells[slot + 1], batteries[slot + 1], lefts[slot + 1]
+        reached, hovered = passed[slot + 1], hovers[slot + 1]
         for u in range(uavs):
             for k in range(devices):
                 worth = value[mission.level[u], k, cell[u, 0], cell[u, 1]]
@@ -362,6 +364,7 @@ def fly_on(mission: Mission, value: np.ndarray, tour: np.ndarray, count: np.ndar
             cell[u, 0] += MOVES[action, 0]
             cell[u, 1] += MOVES[action, 1]
             battery[u] -= COSTS[action]
+    return TourFlight(actions, cells, batteries, lefts, passed, hovers)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -405,14 +408,8 @@ def _collect(mission: Mission, candidates: Candidates, course: Course, start: in
              holder: np.ndarray, rank: np.ndarray, empty: np.ndarray) -> None:
     """Simulate assignment and collection from slot `start` on, with the rules of `assign`.
 
-    Args:
-        mission: mission of the UAVs.
-        candidates: devices in reach of each place.
-        course: places of the UAVs; `left` at the beginning of the slot. Changed.
-        start: first slot.
-        holder: (K,) scratch, all -1.
-        rank: (U,) scratch.
-        empty: (U,) scratch.
+    `course.left` is that at the beginning of the slot; `holder` (K,), all -1, `rank` (U,) and
+    `empty` (U,) are scratch.
     """
     left, listed, worth = course.left, candidates.device, candidates.worth
     (slots, uavs), devices = course.place.shape, len(course.left)
@@ -467,31 +464,14 @@ def _fly_tours(mission: Mission, candidates: Candidates, tour: np.ndarray, count
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _anneal(mission: Mission, candidates: Candidates, tour: np.ndarray, count: np.ndarray,
-            only: int, hot: float, score: float, best_tour: np.ndarray, best_count: np.ndarray,
-            best: float, progress: np.ndarray, course: Course, trial: Course,
-            rng: np.random.Generator) -> tuple[float, float]:
+def _anneal(mission: Mission, candidates: Candidates, search: Search, only: int, hot: float,
+            progress: np.ndarray, rng: np.random.Generator) -> None:
     """Anneal tours: try a random change at every step, and keep it by the Metropolis rule.
 
-    Args:
-        mission: mission of the UAVs.
-        candidates: devices in reach of each place.
-        tour: (U, W, 3) present tours; changed.
-        count: (U,) present numbers of waypoints; changed.
-        only: the only UAV whose tour is changed; -1: any.
-        hot: initial temperature [collected share].
-        score: collected share of the present tours.
-        best_tour: (U, W, 3) best tours; changed.
-        best_count: (U,) their numbers of waypoints; changed.
-        best: their collected share.
-        progress: (n,) progress of the annealing at every step, 0 to 1.
-        course: simulated flight of the present tours; changed.
-        trial: a copy of it; changed.
-        rng: generator of the changes.
-
-    Returns:
-        collected share of the present and of the best tours.
+    `progress` (n,) is that of the annealing at every step, 0 to 1; see `improve` for the others.
     """
+    tour, count, share, course, trial = (
+        search.tour, search.count, search.share, search.course, search.trial)
     (slots, uavs), cold = course.place.shape, END_TEMPERATURE / len(course.left)
     mask, scratch = np.empty(ACTION_COUNT, np.bool_), np.zeros((2, uavs), np.int64)
     holder = np.full(len(course.left), -1)
@@ -511,7 +491,7 @@ def _anneal(mission: Mission, candidates: Candidates, tour: np.ndarray, count: n
             while slot < first and trial.place[slot, u] == course.place[slot, u]:
                 slot += 1
             first = min(first, slot)
-        new = score
+        new = share[0]
         if first < slots:
             trial.left[:] = course.left
             for slot in range(slots - 1, first - 1, -1):  # undo the collection back to that slot
@@ -521,7 +501,7 @@ def _anneal(mission: Mission, candidates: Candidates, tour: np.ndarray, count: n
                         trial.left[k] = course.before[slot, u]
             _collect(mission, candidates, trial, first, holder, scratch[0], scratch[1])
             new = 1.0 - trial.left.sum() / total
-        kept = new >= score or rng.random() < np.exp((new - score) / temperature)
+        kept = new >= share[0] or rng.random() < np.exp((new - share[0]) / temperature)
         source, target = (trial, course) if kept else (course, trial)
         for i in range(n):
             u = changed[i]
@@ -536,8 +516,7 @@ def _anneal(mission: Mission, candidates: Candidates, tour: np.ndarray, count: n
             course.left[:] = trial.left
             course.device[first:] = trial.device[first:]
             course.before[first:] = trial.before[first:]
-            score = new
-            if score > best:
-                best = score
-                best_tour[:], best_count[:] = tour, count
-    return score, best
+            share[0] = new
+            if new > share[1]:
+                share[1] = new
+                search.best_tour[:], search.best_count[:] = tour, count

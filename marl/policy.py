@@ -308,11 +308,6 @@ def demonstrations(missions: list[Mission], iterations: int, rng: np.random.Gene
                    ) -> list[Tensor]:
     """Plan in many missions, fly the plans, and record features and moves for imitation.
 
-    Args:
-        missions: missions, which may differ in size.
-        iterations: plans that the planner tries in each.
-        rng: generator for plans and shadowing.
-
     Returns:
         The fields of `Seen`, each with a row for every UAV and slot in which it still flew, in all
         missions (N rows), and (N,) the move that it then took.
@@ -335,15 +330,9 @@ def demonstrations(missions: list[Mission], iterations: int, rng: np.random.Gene
 
 def imitate(shown: list[Tensor], updates: int, seed: int, batch: int = 1024, rate: float = 3e-3,
             on_progress: Callable[[int], None] = lambda _: None) -> EntityNetwork:
-    """Train a network to predict the moves of demonstrations (cross entropy, Adam).
+    """Train a network to predict the moves of `demonstrations` (cross entropy, Adam).
 
-    Args:
-        shown: result of `demonstrations`.
-        updates: number of updates.
-        seed: random seed of initial weights and batches.
-        batch: UAVs in a batch.
-        rate: initial learning rate; it falls linearly to a hundredth.
-        on_progress: called with the number of updates since the last call.
+    The learning rate falls linearly to a hundredth of `rate`.
     """
     torch.manual_seed(seed)
     network, rng = EntityNetwork(), np.random.default_rng(seed)

@@ -52,9 +52,7 @@ class Promise:
     def record(self, names: Iterable[str], silent: np.ndarray) -> dict[str, Any]:
         """Return the entries of `plan.json` on shares of all data and of each device.
 
-        Args:
-            names: names of the devices.
-            silent: (K,) probability that a device does not transmit.
+        `silent` (K,) is the probability that each of the devices `names` does not transmit.
         """
         devices = [{"device": name, "silent": float(round(s, 3)),
                     "share": _quantiles(each[np.isfinite(each)])
@@ -69,14 +67,8 @@ def promise(prior: Prior, mission: Mission, worlds: int, iterations: int, seed: 
     """Search plans, choose the best, and evaluate it in worlds drawn from the prior.
 
     Each plan is made in a map lowered by another `CAUTION`; a few worlds choose the best.
-
-    Args:
-        prior: prior of the belief, see `marl.worlds.twin_prior`.
-        mission: mission in the twin's map.
-        worlds: number of worlds that evaluate the plan.
-        iterations: plans tried in a search.
-        seed: random seed of plans and worlds.
-        on_progress: called with the number of searches done since the last call.
+    `on_progress` is called with the number of searches done since the last call; see
+    `marl.plan_flights.PlanSettings` for the others.
     """
     source = WorldSource(prior, mission)
     best: tuple[float, Plan] | None = None
@@ -156,13 +148,7 @@ class Size:
 
 
 def sized(mission: Mission, uavs: Iterable[int], battery: float) -> Mission:
-    """Return a mission with copies of some of its UAVs, and another battery.
-
-    Args:
-        mission: mission with the UAVs to copy.
-        uavs: number of the UAV to copy, for each UAV of the result.
-        battery: battery of each UAV [moves].
-    """
+    """Return a mission with copies of its UAVs of some numbers, and another battery [moves]."""
     rows = np.array(list(uavs))
     return mission._replace(
         steps_home=mission.steps_home[rows], start=mission.start[rows],
@@ -191,19 +177,10 @@ def bases(mission: Mission, names: list[str]) -> dict[str, list[int]]:
 def sizes(prior: Prior, mission: Mission, names: list[str], counts: Iterable[int],
           batteries: Iterable[float], wanted: float, worlds: int, iterations: int, seed: int,
           on_progress: Callable[[int], None] = lambda _: None) -> list[Size]:
-    """Evaluate `promise` for combinations of numbers of UAVs, batteries and bases.
+    """Evaluate `promise` for combinations of numbers of UAVs, batteries [moves] and bases.
 
-    Args:
-        prior: prior of the belief.
-        mission: mission in the twin's map.
-        names: names of the mission's UAVs.
-        counts: numbers of UAVs.
-        batteries: batteries [moves]; those that do not reach from start to terminal are left out.
-        wanted: wanted share of the data.
-        worlds: number of worlds.
-        iterations: plans tried in a search.
-        seed: random seed.
-        on_progress: called with the number of searches done since the last call.
+    `names` are those of the mission's UAVs. Batteries that do not reach from start to terminal are
+    left out.
     """
     rows, counts, batteries = [], list(counts), list(batteries)
     for base, group in bases(mission, names).items():

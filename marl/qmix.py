@@ -113,14 +113,7 @@ def _initialise(module: nn.Module, generator: torch.Generator) -> None:
 
 
 class QNetworks:
-    """Agent and mixer with their target networks and optimiser.
-
-    Args:
-        settings: settings of learning.
-        mission: mission, for array sizes.
-        seed: random seed of the initial weights.
-        device: torch device.
-    """
+    """Agent and mixer with their target networks and optimiser; `seed` is of the weights."""
 
     mixes = True
 
@@ -143,13 +136,8 @@ class QNetworks:
     def update(self, flights: Flights, mission: Mission, learning_rate: float) -> dict[str, float]:
         """Make one gradient step on the squared TD errors of recorded flights.
 
-        Args:
-            flights: flights, perhaps of an earlier map.
-            mission: present mission, by which features are computed.
-            learning_rate: learning rate of the step.
-
-        Returns:
-            `loss`, `gradient_norm` and `mean_value` (mean of Q_tot).
+        They may be of an earlier map; features are computed by the present mission. Returned are
+        `loss`, `gradient_norm` and `mean_value` (mean of Q_tot).
         """
         settings, batch = self.settings, self._batch(flights, mission)
         values, _ = self.agent(batch.observation, batch.last_action, batch.sizes)
@@ -255,15 +243,8 @@ def td_lambda_targets(reward: Tensor, best: Tensor, valid: Tensor, discount: flo
                       td_lambda: float) -> Tensor:
     """Compute TD(λ) targets: G_t = r_t + γ ((1 - λ) V_{t+1} + λ G_{t+1}), backwards in time.
 
-    Args:
-        reward: (T, E, 1) reward in each slot.
-        best: (T, E, 1) or (T, E, U) value of the best action in each slot.
-        valid: (T, E, 1) 1 in flight, 0 after its end, where values count as 0.
-        discount: γ.
-        td_lambda: λ.
-
-    Returns:
-        targets in the shape of `best`.
+    `reward` is (T, E, 1), `best` (T, E, 1) or (T, E, U) the value of the best action in each slot,
+    `valid` (T, E, 1) 1 in flight and 0 after its end, where values count as 0.
     """
     ahead = torch.cat([valid[1:], torch.zeros_like(valid[:1])])
     following = torch.cat([best[1:], torch.zeros_like(best[:1])])
@@ -276,12 +257,9 @@ def td_lambda_targets(reward: Tensor, best: Tensor, valid: Tensor, discount: flo
 
 
 class AgentPolicy:
-    """Policy that flies the feasible action with the largest value.
+    """Policy that flies the feasible action with the largest value; exploration replaces some.
 
-    Args:
-        agent: see `Agent`; its present weights are used in every slot.
-        device: torch device of the agent.
-        exploration: exploration that replaces some actions; None: none.
+    The agent's present weights are used in every slot.
     """
 
     def __init__(self, agent: torch.nn.Module, device: str = "cpu",
@@ -314,14 +292,8 @@ class AgentPolicy:
 class Trainer:
     """One replica, which trains networks on flights in a mission.
 
-    Args:
-        make_networks: constructor of networks: (settings, mission, seed, device).
-        settings: settings of learning.
-        mission: mission with the map to train in.
-        horizon: episodes over which the learning rate falls.
-        seed: random seed of the initial weights, common to all replicas.
-        number: number of the replica, for its own random numbers.
-        device: torch device.
+    The learning rate falls over `horizon` episodes. Initial weights, by `seed`, are common to all
+    replicas; other random numbers depend on the `number` of the replica.
     """
 
     def __init__(self, make_networks: Callable[..., Any], settings: LearnerSettings,
@@ -378,10 +350,7 @@ class Trainer:
         """Fly some flights with exploration."""
         exploration = Exploration(self.epsilon, self.settings.excursion_slots, self._rng)
         policy = AgentPolicy(self.networks.agent, self.networks.device, exploration)
-        return fly(self._environment(count), policy)
-
-    def _environment(self, count: int) -> Environment:
-        return Environment(self.mission, count, self._rng)
+        return fly(Environment(self.mission, count, self._rng), policy)
 
     def weights(self) -> dict[str, np.ndarray]:
         """Return copies of the weights that replicas average."""

@@ -17,7 +17,15 @@ from marl.environment import ACTION_COUNT, Frame, uav_snr_db
 from marl.flights import Policy
 from marl.learner import Learner, Setup
 from marl.mission import Mission
-from marl.planner import Plan, expected_data, fly_on, improve, next_action, plan, take_off
+from marl.planner import (
+    Candidates,
+    Plan,
+    expected_data,
+    expected_flight,
+    improve,
+    next_action,
+    plan,
+)
 from marl.settings import stream
 from radiotwin.runtime.compiled import njit
 
@@ -32,11 +40,8 @@ class ReplanPolicy:
         believed: the mission with the map and data that the UAVs assume.
         prior: prior of the belief; None: the map is fixed.
         linked: whether the UAVs always communicate; otherwise only in reach of each other.
-        every: slots between searches.
-        iterations: plans tried in a search.
-        first_iterations: plans tried before take-off.
-        seed: random seed of the first plan.
-        rng: generator of the searches in flight.
+        every: slots between searches of `iterations` plans; `first_iterations` before take-off.
+        seed, rng: of the first plan, and of the searches in flight.
     """
 
     def __init__(self, believed: Mission, prior: Prior | None, linked: bool, every: int,
@@ -54,8 +59,8 @@ class ReplanPolicy:
             data_units, self._value = weighted(Belief(prior, believed), believed.data_units)
             self._planned = self._planned._replace(data_units=data_units)
         self._first = plan(self._planned, first_iterations, seed, self._value)
-        self._expected = _expected_flight(self._planned, self._value, self._first.tour,
-                                          self._first.visits)
+        self._expected = expected_flight(self._planned, self._value, self._first.tour,
+                                         self._first.visits)
 
     def start(self, mission: Mission, flights: int) -> None:
         """See `marl.flights.Policy`; the map of the mission that is flown is not read."""
@@ -134,20 +139,20 @@ class ReplanPolicy:
         UAVs that it met are assumed to fly the tours of that meeting, others those of the first
         plan.
         """
-        cells, batteries, _, *passed = (array[self._slot] for array in self._expected)
-        cells, batteries = cells.copy(), batteries.copy()
-        tours = [_remaining(self._first.tour[v], self._first.visits[v], passed[0][v], passed[1][v])
-                 for v in range(self._mission.uavs)]
+        now, planned = self._slot, self._expected
+        cells, batteries = planned.cell[now].copy(), planned.battery[now].copy()
+        tours = [_remaining(*each) for each in zip(self._first.tour, self._first.visits,
+                                                   planned.reached[now], planned.hovered[now])]
         for v, (slot, cell, battery, tour) in knowledge.others.items():
             # Simulate that UAV from the slot in which they met until now.
             start = self._planned._replace(start=cell[None], battery=np.array([battery]),
                                            level=np.zeros(1, dtype=np.int64),
                                            steps_home=self._mission.steps_home[v:v + 1])
-            course = _expected_flight(start, self._value[v:v + 1], tour[0][None],
-                                      np.array([tour[1]]))
-            now = min(self._slot - slot, len(course[0]) - 1)
-            cells[v], batteries[v] = course[0][now, 0], course[1][now, 0]
-            tours[v] = _remaining(*tour, int(course[3][now, 0]), int(course[4][now, 0]))
+            course = expected_flight(start, self._value[v:v + 1], tour[0][None],
+                                     np.array([tour[1]]))
+            now = min(self._slot - slot, len(course.cell) - 1)
+            cells[v], batteries[v] = course.cell[now, 0], course.battery[now, 0]
+            tours[v] = _remaining(*tour, int(course.reached[now, 0]), int(course.hovered[now, 0]))
         return cells, batteries, tours
 
     def _left(self, knowledge: "_Knowledge") -> np.ndarray:
@@ -155,7 +160,7 @@ class ReplanPolicy:
 
         It is the amount seen last, less the share that the first plan would have collected since.
         """
-        planned, devices = self._expected[2], np.arange(self._mission.devices)
+        planned, devices = self._expected.left, np.arange(self._mission.devices)
         before = planned[knowledge.seen_in, devices]
         kept = np.divide(planned[self._slot], before, out=np.zeros(len(before)), where=before > 0)
         return knowledge.seen * kept
@@ -169,7 +174,7 @@ class ReplanPolicy:
         mission = self._planned._replace(start=cell, battery=battery, data_units=data_units)
         if not mission.data_units.any():
             return None
-        return improve(mission, value, np.array([tour for tour, _ in tours]),
+        return improve(mission, Candidates.of(value), np.array([tour for tour, _ in tours]),
                        np.array([count for _, count in tours]), self._iterations, self._rng,
                        only=only, temperature=LOW_TEMPERATURE)
 
@@ -250,11 +255,7 @@ class BeliefPlanner(Learner):
 
 
 def weighted(belief: Belief, data_units: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Multiply the data of each device by the probability that it transmits, for planning.
-
-    Args:
-        belief: belief of the map and of silent devices.
-        data_units: (K,) data left at each device.
+    """Multiply the data (K,) left at devices by the probability that they transmit, for planning.
 
     Returns:
         (K,) expected data, and (U, K, ny, nx) expected data of a slot on each link.
@@ -286,25 +287,3 @@ def _follow(mission: Mission, frame: Frame, tour: np.ndarray, count: np.ndarray,
                 mission, u, row, column, np.int64(frame.battery[e, u]),  # type: ignore[arg-type]
                 tour[e, u], count[e, u], reached[e, u], hovered[e, u], mask)
     return action
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _expected_flight(mission: Mission, value: np.ndarray, tour: np.ndarray, count: np.ndarray,
-                     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Simulate the tours of a plan; each link yields its expected data `value` in a slot.
-
-    Returns:
-        state at the beginning of every slot: cells (T, U, 2), batteries (T, U), data left (T, K),
-        waypoints passed (T, U), hovers done at the next waypoint (T, U).
-    """
-    slots, uavs, devices = mission.battery.max() + 1, len(tour), value.shape[1]
-    cells = np.empty((slots, uavs, 2), np.int64)
-    batteries = np.empty((slots, uavs), np.int64)
-    left = np.empty((slots, devices))
-    reached, hovered = np.empty((slots, uavs), np.int64), np.empty((slots, uavs), np.int64)
-    flight, actions = take_off(mission, devices), np.empty((1, uavs), np.int8)
-    for slot in range(slots):
-        cells[slot], batteries[slot], left[slot] = flight.cell, flight.battery, flight.left
-        reached[slot], hovered[slot] = flight.reached, flight.hovered
-        fly_on(mission, value, tour, count, flight, actions)
-    return cells, batteries, left, reached, hovered

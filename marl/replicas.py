@@ -24,10 +24,7 @@ _COPIES = 4  # copies of the weights: network, target network, two moments of th
 
 
 def limit_threads(count: int) -> None:
-    """Limit PyTorch and BLAS to `count` threads in this process; 1 is fastest for small matrices.
-
-    It lasts until the process ends.
-    """
+    """Limit PyTorch and BLAS in this process for good; one thread is fastest for small matrices."""
     torch.set_num_threads(count)
     threadpoolctl.threadpool_limits(count)
 
@@ -73,10 +70,6 @@ class Replicas:
 
     Three processes use two cores 25 % better than three threads. With a single replica or core they
     train one after the other in this process, with the same result.
-
-    Args:
-        made: class of the trainers, such as `marl.qmix.Trainer`.
-        arguments: arguments of each trainer.
     """
 
     def __init__(self, made: Callable[..., Any], arguments: Sequence[tuple]) -> None:
@@ -96,15 +89,7 @@ class Replicas:
             raise
 
     def call(self, method: str, *arguments: Any, each: list | None = None) -> list:
-        """Call a method of all trainers in parallel.
-
-        Args:
-            method: name of a method of a trainer.
-            arguments: common arguments.
-            each: one further argument for each replica.
-
-        Returns:
-            the result of each replica.
+        """Call a method of all trainers in parallel; `each` has a further argument for each.
 
         Raises:
             RunFailed: a process has ended.

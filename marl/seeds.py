@@ -59,11 +59,7 @@ def run_seeds(run: RunSettings, learner: LearnerSettings, out: Path, resume: boo
 
 
 def over_seeds(ratio: np.ndarray) -> dict[str, float]:
-    """Return the interquartile mean of the shares (S,) of S seeds, and its bootstrap band.
-
-    Returns:
-        `truth_ratio`, `low`, `high`; the band of a single seed is NaN.
-    """
+    """Return interquartile mean of shares (S,) of S seeds, and bootstrap band; NaN of a single."""
     if len(ratio) == 1:
         return {"truth_ratio": float(ratio[0]), "low": np.nan, "high": np.nan}
     draws = np.random.default_rng(0).choice(ratio, (DRAWS, len(ratio)))

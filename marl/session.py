@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from marl.algorithm1 import FLIGHTS, Campaign, Outcome, run_algorithm
+from marl.algorithm1 import FLIGHTS, Campaign, run_algorithm
 from marl.figures import choose_flight, draw_curve, save, save_animation, trajectories_figure
 from marl.flights import evaluate, track_table
 from marl.learner import make_learner
@@ -63,8 +63,7 @@ class Session:
     def execute(self) -> tuple[pd.DataFrame, dict[str, list[dict]]]:
         """Run Algorithm 1 and its comparison, write the folder, and print the table.
 
-        Returns:
-            the table of all methods, and the log of each run by its name.
+        Returned are the table of all methods, and the log of each run by its name.
 
         Raises:
             BadInput: an unusable scene or truth, a folder that is not empty, or settings other than
@@ -115,10 +114,8 @@ class Session:
     def _begin_beside(self, stack: ExitStack) -> "list[tuple[RunSettings, Future[list[dict]]]]":
         """Start the runs of the comparison, one after the other in a process of their own.
 
-        FedQMIX is compared by a single replica of QMIX, which takes a third of the work.
-
-        Returns:
-            settings and future log of each run.
+        FedQMIX is compared by a single replica of QMIX, which takes a third of the work. Returned
+        are settings and future log of each run.
         """
         main = self.run
         twins = {"none": (), "twins": ("nn", "log-distance"),
@@ -164,7 +161,7 @@ class Session:
         with atomic_file(path) as file:
             file.write(json.dumps(config, indent=1).encode())
 
-    def _write(self, scene: Scene, truth: RadioMap, main: Outcome, curves: dict[str, list[dict]],
+    def _write(self, scene: Scene, truth: RadioMap, main: Campaign, curves: dict[str, list[dict]],
                entries: list[dict]) -> pd.DataFrame:
         """Evaluate the baselines, write tables and figures, and print and return the comparison."""
         real = make_mission(scene, truth, main.known, self.run.assignment)
@@ -202,16 +199,10 @@ class Session:
         return table
 
     def _baseline(self, name: str, trained_in: Mission, real: Mission, flown: dict) -> dict:
-        """Evaluate a method without training.
+        """Evaluate a method without training, and return its row of the table.
 
-        Args:
-            name: name of the algorithm.
-            trained_in: mission in which it is prepared.
-            real: mission in the truth, in which it flies.
-            flown: numbers of the real flights on which its map is based.
-
-        Returns:
-            its row of the table.
+        It is prepared in one mission, and flies in another, in the truth; `flown` are the numbers
+        of the real flights on which its map is based.
         """
         run = self.run.model_copy(update={"algorithm": name})
         learner = make_learner(run, self.learner, trained_in, 1)

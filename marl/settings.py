@@ -182,11 +182,7 @@ class RunSettings(BaseModel):
 
 
 def check_together(learner: LearnerSettings) -> None:
-    """Refuse settings of learning that are allowed one by one, but not together.
-
-    Raises:
-        BadInput: a replay memory smaller than a batch, or than the flights simulated at a time.
-    """
+    """Refuse settings of learning that are allowed one by one, but not together, BadInput."""
     if learner.batch > learner.replay or learner.parallel > learner.replay:
         raise BadInput(
             f"replay {learner.replay}: it must hold a batch ({learner.batch} flights) and what is "
@@ -194,13 +190,7 @@ def check_together(learner: LearnerSettings) -> None:
 
 
 def stream(seed: int, purpose: str, number: int = 0) -> np.random.Generator:
-    """Return an independent random generator for a purpose.
-
-    Args:
-        seed: seed of the run.
-        purpose: one of `PURPOSES`.
-        number: number of the replica, flight or round.
-    """
+    """Return an independent random generator for one of `PURPOSES`, by replica, flight or round."""
     # Counted from 1, since numpy treats the seeds [1, 2, 0] and [1, 2] alike.
     return np.random.default_rng([seed, PURPOSES.index(purpose) + 1, number + 1])
 

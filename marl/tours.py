@@ -9,23 +9,12 @@ from radiotwin.runtime.compiled import njit
 def change(tour: np.ndarray, count: np.ndarray, only: int, level: np.ndarray, peaks: np.ndarray,
            left: np.ndarray, rows: int, columns: int, rng: np.random.Generator,
            changed: np.ndarray, first: np.ndarray) -> int:
-    """Change one tour, or two, at random in place.
+    """Change one tour, or two, at random in place; return how many have changed.
 
-    Args:
-        tour: (U, W, 3) waypoints (row, column, hovers) of each UAV; changed.
-        count: (U,) number of waypoints of each UAV; changed.
-        only: UAV whose tour changes; -1 for any.
-        level: (U,) level of the maps, see `Mission`.
-        peaks: (L, K, 2) cell where each device is heard best.
-        left: (K,) data that the plan leaves; devices with much of it attract new waypoints.
-        rows: number of rows of the lattice.
-        columns: number of columns of the lattice.
-        rng: generator of the change.
-        changed: (2,) output: UAVs whose tours have changed.
-        first: (2,) output: index of the first changed waypoint of each.
-
-    Returns:
-        Number of tours that have changed, 1 or 2.
+    `tour` (U, W, 3) and `count` (U,) are as in `marl.planner.Plan`; `only` is the UAV whose tour
+    changes, -1 any. `peaks` (L, K, 2) are the cells where devices are heard best; those with much
+    data `left` (K,) attract new waypoints. Written to `changed` (2,) are the UAVs whose tours have
+    changed, to `first` (2,) the index of the first changed waypoint of each.
     """
     u = int(only if only >= 0 else rng.integers(0, len(count)))
     n, max_count = count[u], tour.shape[1]

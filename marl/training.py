@@ -18,11 +18,8 @@ class Exploration:
     Independent random moves hardly ever take a UAV across the city (Dabney, Ostrovski and Barreto,
     ICLR 2021; here with a geometric distribution of lengths). Each UAV explores independently.
 
-    Args:
-        epsilon: share of the slots in which UAVs explore.
-        mean_slots: mean length of an excursion, at least 1; it ends early if its action is not
-            feasible.
-        rng: random generator.
+    `epsilon` is the share of the slots in which UAVs explore. An excursion takes `mean_slots` in
+    the mean, at least 1, and ends early if its action is not feasible.
     """
 
     def __init__(self, epsilon: float, mean_slots: float, rng: np.random.Generator) -> None:
@@ -43,17 +40,13 @@ class Exploration:
         begins = (self._rng.random(action.shape) < self._begin) & (self._left == 0)
         lots = np.where(mask, self._rng.random(mask.shape), -1.0).argmax(axis=-1)
         self._kept[begins] = lots[begins]
-        self._left[begins] = self._lengths(action.shape)[begins]
+        lengths = np.ones(action.shape, dtype=np.int64) if self._mean_slots == 1 else \
+            self._rng.geometric(1 / self._mean_slots, action.shape)
+        self._left[begins] = lengths[begins]
         feasible = np.take_along_axis(mask, self._kept[..., None], axis=-1)[..., 0]
         explores = (self._left > 0) & feasible
         self._left = np.where(explores, self._left - 1, 0)
         return np.where(explores, self._kept, action)
-
-    def _lengths(self, shape: tuple[int, ...]) -> np.ndarray:
-        """Draw lengths of excursions [slots]."""
-        if self._mean_slots == 1:
-            return np.ones(shape, dtype=np.int64)
-        return self._rng.geometric(1 / self._mean_slots, shape)
 
 
 class Replay:
@@ -96,11 +89,6 @@ class Replay:
         slots = kept.length[rows].max()
         return Flights(Frame(*(array[rows, :slots] for array in kept.frames)),
                        kept.action[rows, :slots], kept.collected[rows, :slots], kept.length[rows])
-
-    @property
-    def bytes(self) -> int:
-        """Allocated memory [bytes]."""
-        return sum(array.nbytes for array in _arrays(self._flights).values())
 
     def state(self) -> dict[str, Any]:
         """Return the state for a checkpoint."""

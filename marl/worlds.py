@@ -24,13 +24,7 @@ def twin_prior(twin: Twin, scene: Scene, radio_map: RadioMap, rng: np.random.Gen
                silent: float = 0.0, data_spread: float = 0.0) -> Prior:
     """Return the prior over device positions and SNR maps that a twin's uncertainty implies.
 
-    Args:
-        twin: twin with positions, credible radii and map errors.
-        scene: scene of the mission.
-        radio_map: map of the twin, for transmit powers.
-        rng: generator of the positions.
-        silent: probability that a device does not transmit.
-        data_spread: relative half-width of each device's data, see `Prior`.
+    `radio_map` is the twin's, for transmit powers; see `Prior` for `silent` and `data_spread`.
     """
     errors = ErrorCorrelation.from_provenance(twin)
     levels = np.unique(levels_of(scene))
@@ -110,12 +104,7 @@ def draw_positions(twin: Twin, row: int, scene: Scene, count: int,
 
 
 class WorldSource:
-    """Generator of possible real missions from a prior.
-
-    Args:
-        prior: prior of the belief.
-        mission: mission in the twin's map.
-    """
+    """Generator of possible real missions from a prior and the mission in the twin's map."""
 
     def __init__(self, prior: Prior, mission: Mission) -> None:
         self._prior, self._mission = prior, mission

@@ -58,13 +58,8 @@ class Party:
 class Client:
     """A party that trains on request, and continues from the checkpoint in its folder.
 
-    Args:
-        run: settings common to all parties; scene and truth are the party's own.
-        settings: common settings of learning.
-        party: private data.
-
-    Attributes:
-        sizes: numbers of UAVs and devices of its scene.
+    Settings are common to all parties, but for scene and truth. `sizes` are the numbers of UAVs and
+    devices of its scene.
 
     Raises:
         BadInput: a scene, measurements, settings or a checkpoint that cannot be used.
@@ -97,12 +92,8 @@ class Client:
     def train(self, number: int, mean: Weights) -> tuple[Weights, int]:
         """Train for a round from the mean weights, and write the checkpoint.
 
-        Args:
-            number: number of the round, from 1; rounds may have been missed.
-            mean: mean weights of the round before; at first the initial weights.
-
-        Returns:
-            the trained weights, and the number of training episodes.
+        Rounds count from 1, and some may have been missed; the first mean is the initial weights.
+        Returned are the trained weights and the number of training episodes.
 
         Raises:
             BadInput: no such round, or weights of other names, shapes or values.
@@ -127,11 +118,7 @@ class Client:
         return weights, episodes
 
     def finish(self, mean: Weights) -> int:
-        """Evaluate the policy of the last mean weights; write the log and the checkpoint.
-
-        Returns:
-            the number of flights of the evaluation.
-        """
+        """Evaluate the last mean weights, and write log and checkpoint; return the flights."""
         self._judge(mean)
         if self._entered:
             self._log()

@@ -162,10 +162,7 @@ def main(grid: Grid, context: Context) -> None:
 def usable(replies: list[Message], like: Weights, max_count: int) -> list[tuple[Weights, int]]:
     """Return weights and episode counts of the valid replies, and log the others.
 
-    Args:
-        replies: replies of parties, which may contain anything.
-        like: weights with the right names and shapes.
-        max_count: episodes of the round.
+    Replies may contain anything; weights should be `like` these, and counts at most `max_count`.
     """
     found = []
     for reply in replies:

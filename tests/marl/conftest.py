@@ -244,6 +244,24 @@ def tiny():
 
 
 @pytest.fixture(scope="session")
+def corners(tiny):
+    """A mission, and the largest share of its data that two UAVs can collect.
+
+    Two devices in opposite corners are heard well in the corner and badly one cell beside it; both UAVs start in the
+    middle. There and back costs 16 of 24 hovers, so a UAV spends 8 hovers and the slot of its leaving in a corner,
+    and passes a cell beside it twice. More of a device than one UAV takes is never there to be had.
+    """
+    snr_db = np.full((2, 2, 5, 5), -np.inf)
+    for k, (corner, beside) in enumerate([((0, 0), [(0, 1), (1, 0)]), ((4, 4), [(4, 3), (3, 4)])]):
+        snr_db[(slice(None), k, *corner)] = 25.0
+        for cell in beside:
+            snr_db[(slice(None), k, *cell)] = 10.0
+    mission = tiny(0, devices=2, snr_db=snr_db, battery=(24, 24), data_units=[10_000.0, 10_000.0],
+                   known_m=[[0, 0], [80, 80]])
+    return mission, 2 * (9 * rate(25.0, 100) + 2 * rate(10.0, 100)) / 20_000
+
+
+@pytest.fixture(scope="session")
 def missions():
     """A hypothesis strategy."""
     return any_mission()

@@ -11,7 +11,7 @@ import marl.replicas
 from marl.algorithm1 import run_algorithm
 from marl.fedqmix.client import Client, Party
 from marl.fedqmix.federation import FedQMIX, average, initial_weights, require_weights, rounds_of
-from marl.fedqmix.session import FederatedSession, federate
+from marl.fedqmix.session import FederatedSession
 from marl.fedqmix.settings import FederationSettings, Shared
 from marl.settings import PRESETS, RunSettings
 from radiotwin.errors import BadInput
@@ -99,18 +99,6 @@ def test_a_party_goes_on_from_its_checkpoint_to_the_bit(shared, parties, tmp_pat
     a, b = (pd.read_csv(folder / "metrics.csv") for folder in (parties[0].folder, other.folder))
     same = [name for name in a if not name.endswith("_s")]
     pd.testing.assert_frame_equal(a[same], b[same])
-
-
-def test_the_session_makes_the_same_means_in_one_process(shared, parties):
-    shared = in_truth(shared)
-    others = [Party(party.scene, party.folder / "other", party.number, "segmented") for party in parties]
-    first, *means = federate(shared, [Client(shared.run, LEARNER, party) for party in others])
-    clients = [Client(shared.run, LEARNER, party) for party in parties]
-    for number, mean in enumerate(means, 1):
-        first = average([client.train(number, first)[0] for client in clients])
-        for name in mean:
-            np.testing.assert_array_equal(mean[name], first[name])
-    assert all((party.folder / "metrics.csv").exists() for party in others)
 
 
 def test_a_party_that_missed_rounds_goes_on(shared, parties):

@@ -17,8 +17,8 @@ from marl.settings import settings_of
 from radiotwin.runtime import cuda
 from tests.command_line import run_planning
 
-SMALL = ("--truth segmented --real-episodes 2 --episodes 40 --batch 8 --replay 40 --flights 8 "
-         "--planner-iterations 300 ")
+SMALL = ("--truth segmented --real-episodes 2 --episodes 20 --batch 8 --replay 20 --flights 4 --selection-flights 8 "
+         "--planner-iterations 100 ")
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ def test_a_whole_run_writes_everything_and_ends_in_the_table(unbroken):
     assert [line.split()[:2] for line in lines] == [["fedqmix", "NN"], ["qmix", "log-distance"], ["qmix", "the"],
                                                     ["planner", "NN"], ["heuristic", "2"], ["greedy", "2"], ["random", "0"]]
     # Trained in the truth, every episode is a real one, and so are three looks at the policy.
-    assert lines[2].split()[3:8] == ["0", "+", "80", "+", str(3 * 64)]
+    assert lines[2].split()[3:8] == ["0", "+", "40", "+", str(3 * 8)]
     for name in ("config.json", "metrics.csv", "checkpoint.safetensors", "comparison.csv", "curve.png", "trajectories.png",
                  "flight.gif", "flights.csv", "twin/twin.json", "compare/truth/metrics.csv"):
         assert (folder / name).is_file(), name

@@ -8,7 +8,6 @@ from PIL import Image
 from marl.environment import Environment
 from marl.figures import (
     MAX_IMAGES,
-    choose_flight,
     curve_figure,
     draw_curve,
     save,
@@ -30,11 +29,6 @@ def flown(mission, flights=3):
 
 def is_png(path):
     return path.read_bytes().startswith(b"\x89PNG") and path.stat().st_size > 10_000
-
-
-def test_the_chosen_flight_is_the_middle_one(city_mission):
-    flights = flown(city_mission, 5)
-    assert flights.ratio(city_mission)[choose_flight(flights, city_mission)] == np.median(flights.ratio(city_mission))
 
 
 def test_trajectories_have_a_panel_a_uav_and_a_segment_a_slot(small_scene, city_mission, tmp_path):

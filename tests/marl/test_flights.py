@@ -8,35 +8,6 @@ from marl.flights import fly, track_table
 from marl.heuristics import HeuristicPolicy
 
 
-class Watching:
-    """Keeps the frames and actions of another policy."""
-
-    def __init__(self, policy):
-        self.policy, self.frames, self.actions = policy, [], []
-
-    def start(self, mission, flights):
-        self.policy.start(mission, flights)
-
-    def act(self, frame):
-        self.frames.append(frame.copy())
-        self.actions.append(self.policy.act(frame).copy())
-        return self.actions[-1]
-
-
-def test_a_record_holds_every_frame_and_action(city_mission):
-    rng = np.random.default_rng(0)
-    watching = Watching(HeuristicPolicy("random", rng))
-    flights = fly(Environment(city_mission, 5, rng), watching)
-    for slot, (frame, action) in enumerate(zip(watching.frames, watching.actions)):
-        for kept, seen in zip(flights.frames, frame):
-            np.testing.assert_array_equal(kept[:, slot], seen)
-        np.testing.assert_array_equal(flights.action[:, slot], action)
-    for e, length in enumerate(flights.length):
-        batteries = [frame.battery[e].max() for frame in watching.frames]
-        assert batteries[length - 1] > 0 and all(battery == 0 for battery in batteries[length:])
-    assert flights.length.max() == len(watching.frames) <= city_mission.longest
-
-
 def test_a_track_table_says_where_each_uav_was_and_what_it_collected(small_scene, city_mission):
     flights = fly(Environment(city_mission, 3, np.random.default_rng(0)),
                   HeuristicPolicy("random", np.random.default_rng(1)))

@@ -37,13 +37,3 @@ def test_large_inputs_saturate_and_stay_finite():
     x = 1e4 * torch.randn(5, 3, 4)
     torch.testing.assert_close(gru(x.flatten(0, 1), np.full(5, 3), None, unit)[0].view(5, 3, 4), unit(x)[0], rtol=1e-4,
                                atol=1e-5)
-
-
-def test_one_sequence_is_its_parts_with_the_memory_carried_over():
-    unit = torch.nn.GRU(4, 6)
-    x = torch.randn(30, 4)
-    whole, last = gru(x, np.full(10, 3), None, unit)
-    first, memory = gru(x[:12], np.full(4, 3), None, unit)
-    rest, end = gru(x[12:], np.full(6, 3), memory, unit)
-    torch.testing.assert_close(torch.cat([first, rest]), whole)
-    torch.testing.assert_close(end, last)

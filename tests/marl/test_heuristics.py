@@ -32,26 +32,16 @@ def test_greedy_uavs_claim_different_devices_fly_the_longer_way_first_and_hover_
     assert greedy_actions(mission, environment.frame, rng).tolist() == [[HOVER, NORTH]]
 
 
-def test_greedy_uavs_that_have_landed_claim_no_device(tiny):
-    mission = tiny(0, uavs=2, devices=1, battery=(20, 20), known_m=[[60.0, 40.0]], snr_db=20.0)
-    environment = Environment(mission, 1, np.random.default_rng(0))
-    environment.reset().battery[0, 0] = 0
-    assert greedy_actions(mission, environment.frame, np.random.default_rng(0)).tolist() == [[NO_OP, EAST]]
-
-
-def test_greedy_turns_to_another_device_when_one_is_empty(tiny):
-    mission = tiny(0, uavs=1, devices=2, battery=(30,), known_m=[[60.0, 40.0], [40.0, 80.0]], data_units=[1.0, 1e6],
-                   snr_db=20.0)
-    environment = Environment(mission, 1, np.random.default_rng(0))
-    environment.reset()
-    environment.frame.data_units[0, 0] = 0.0
-    assert greedy_actions(mission, environment.frame, np.random.default_rng(0)).tolist() == [[NORTH]]
-
-
-def test_greedy_ignores_devices_without_a_known_position(tiny):
-    mission = tiny(0, uavs=1, devices=2, battery=(30,), known_m=[[np.nan, np.nan], [40.0, 80.0]], snr_db=20.0)
-    environment = Environment(mission, 1, np.random.default_rng(0))
-    assert greedy_actions(mission, environment.reset(), np.random.default_rng(0)).tolist() == [[NORTH]]
+@pytest.mark.parametrize("known_m, change, actions", [
+    ([[60.0, 40.0]], lambda frame: frame.battery[0].put(0, 0), [NO_OP, EAST]),  # who has landed claims nothing
+    ([[60.0, 40.0], [40.0, 80.0]], lambda frame: frame.data_units[0].put(0, 0), [NORTH]),  # an empty device
+    ([[np.nan, np.nan], [40.0, 80.0]], lambda frame: None, [NORTH])])  # a device that is not located
+def test_greedy_uavs_fly_to_what_is_left(tiny, known_m, change, actions):
+    uavs, devices = len(actions), len(known_m)
+    mission = tiny(0, uavs=uavs, devices=devices, battery=(30, 30), known_m=known_m, data_units=[1e6] * devices, snr_db=20.0)
+    frame = Environment(mission, 1, np.random.default_rng(0)).reset()
+    change(frame)
+    assert greedy_actions(mission, frame, np.random.default_rng(0)).tolist() == [actions]
 
 
 def test_random_actions_are_any_feasible_one_with_equal_chances(tiny):
@@ -59,14 +49,6 @@ def test_random_actions_are_any_feasible_one_with_equal_chances(tiny):
     environment = Environment(mission, 6000, np.random.default_rng(0))
     counts = np.bincount(random_actions(mission, environment.reset(), np.random.default_rng(1))[:, 0], minlength=6)
     assert counts[5] == 0 and np.abs(counts[:5] / 6000 - 0.2).max() < 4 * np.sqrt(0.16 / 6000)
-
-
-def test_greedy_collects_more_than_random(city_mission):
-    mission = city_mission._replace(data_units=2 * city_mission.data_units)
-    greedy, chance = (fly(Environment(mission, 32, np.random.default_rng(0)),
-                          HeuristicPolicy(name, np.random.default_rng(0))).ratio(mission) for name in
-                      ("greedy", "random"))
-    assert greedy.mean() > chance.mean() + 0.1
 
 
 @given(st.data())
@@ -100,9 +82,8 @@ def seen(mission, policy):
     return len(np.unique(cells.reshape(-1, 2), axis=0))
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_every_action_is_feasible_and_all_uavs_land_with_an_empty_battery(small_scene, city_mission, seed):
-    actions = waypoint_actions(small_scene, city_mission, np.random.default_rng(seed))
+def test_every_action_is_feasible_and_all_uavs_land_with_an_empty_battery(small_scene, city_mission):
+    actions = waypoint_actions(small_scene, city_mission, np.random.default_rng(0))
     assert actions.shape == (city_mission.longest, city_mission.uavs)
     environment, policy = Environment(city_mission, 1, np.random.default_rng(0)), PlanPolicy(actions)
     frame = environment.reset()
@@ -121,9 +102,3 @@ def test_waypoint_flights_cover_more_cells_than_random_steps(small_scene, city_m
                     for make in (lambda rng: PlanPolicy(waypoint_actions(small_scene, city_mission, rng)),
                                  lambda rng: HeuristicPolicy("random", rng)))
     assert about > 1.2 * steps
-
-
-def test_the_same_seed_gives_the_same_waypoint_flights(small_scene, city_mission):
-    one, same, other = (waypoint_actions(small_scene, city_mission, np.random.default_rng(seed)) for seed in (1, 1, 2))
-    np.testing.assert_array_equal(one, same)
-    assert (one != other).any()

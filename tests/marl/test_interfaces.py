@@ -13,13 +13,9 @@ import gymnasium  # noqa: E402
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 from pettingzoo.test import parallel_api_test, parallel_seed_test  # noqa: E402
 
-from marl.environment import Environment, global_state, observe, safe_actions  # noqa: E402  # noqa: E402
-from marl.interfaces import (  # noqa: E402
-    CentralEnv,
-    CentralVectorEnv,
-    HarvestEnv,  # noqa: E402
-)
-from marl.mission import HOVER, NO_OP  # noqa: E402
+from marl.environment import Environment, global_state, observe, safe_actions  # noqa: E402
+from marl.interfaces import CentralEnv, CentralVectorEnv, HarvestEnv  # noqa: E402
+from marl.mission import NO_OP  # noqa: E402
 
 
 def test_pettingzoos_own_tests_pass(city_mission):
@@ -33,10 +29,9 @@ def test_gymnasiums_own_check_passes(city_mission):
     check_env(CentralEnv(city_mission), skip_render_check=True)
 
 
-@pytest.mark.parametrize("seed", [0, 7])
-def test_each_agent_sees_and_collects_what_the_batched_environment_says(city_mission, seed):
-    env, batched = HarvestEnv(city_mission, ["a", "b"]), Environment(city_mission, 1, np.random.default_rng(seed))
-    observations, infos = env.reset(seed=seed)
+def test_each_agent_sees_and_collects_what_the_batched_environment_says(city_mission):
+    env, batched = HarvestEnv(city_mission, ["a", "b"]), Environment(city_mission, 1, np.random.default_rng(7))
+    observations, infos = env.reset(seed=7)
     batched.reset()
     rng, total = np.random.default_rng(1), 0.0
     while env.agents:
@@ -82,18 +77,6 @@ def test_flights_of_the_vector_are_those_of_the_batched_environment(city_mission
         np.testing.assert_array_equal(ended, anew)
         assert not cut.any() and not infos["replaced"].any()
     assert resets >= 3, "flights ended and began anew while others went on"
-
-
-def test_one_flight_is_the_first_of_the_batched(city_mission):
-    env, other = CentralEnv(city_mission), CentralEnv(city_mission)
-    hover = np.full(city_mission.uavs, HOVER)
-    seen, _ = env.reset(seed=3)
-    batched = Environment(city_mission, 1, np.random.default_rng(3))
-    np.testing.assert_array_equal(seen["observation"], observe(city_mission, batched.reset())[0][0])
-    other.reset(seed=4)
-    rewards = [[each.step(hover)[1] for each in (env, other)] for _ in range(8)]
-    assert [one for one, _ in rewards] == pytest.approx([batched.step(hover[None]).sum() for _ in range(8)])
-    assert [one for one, _ in rewards] != [two for _, two in rewards], "another seed draws another shadowing"
 
 
 def test_infeasible_actions_are_replaced_and_every_uav_gets_home(city_mission):

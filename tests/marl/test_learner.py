@@ -22,7 +22,6 @@ from marl.settings import (
     learners,
     settings_of,
 )
-from radiotwin.errors import BadInput
 from radiotwin.maps.survey import segmented_truth
 from radiotwin.runtime.plugins import entry_points
 
@@ -106,12 +105,6 @@ def test_a_new_learner_resumes(small_scene, tmp_path, best_of_many):
         execute(tmp_path, False, stop)
     resumed = execute(tmp_path, True, lambda *_: None)
     np.testing.assert_array_equal(resumed.flights.action, unbroken.flights.action)
-
-
-def test_an_unknown_learner_is_refused_as_every_other_choice():
-    with pytest.raises(BadInput, match=r"--algorithm best-of-many: Input should be 'fedqmix', .* or 'random'; allowed: "
-                                       r"fedqmix\|qmix\|iql\|greedy\|heuristic\|policy\|planner\|belief\|random"):
-        settings_of({"algorithm": "best-of-many"})
 
 
 def test_a_learner_sees_no_map_before_it_is_prepared(city_mission):

@@ -36,13 +36,3 @@ def test_many_worlds_are_as_many_environments(city):
             for one, other in zip(worlds.frames[world], each.frame):
                 np.testing.assert_array_equal(one, other)
     assert not worlds.battery.any()
-
-
-def test_one_of_many_worlds_draws_the_shadowing_of_an_environment(city):
-    draws = [np.random.default_rng(7) for _ in range(2)]
-    worlds, alone = ManyWorlds([city], city.uavs, draws[0]), Environment(city, 1, draws[1])
-    alone.reset()
-    hover = np.zeros((1, city.uavs), np.int64)
-    for _ in range(4):
-        np.testing.assert_array_equal(worlds.step(hover), alone.step(hover))
-        np.testing.assert_array_equal(worlds.frames[0].snr_db, alone.frame.snr_db)

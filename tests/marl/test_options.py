@@ -42,12 +42,6 @@ def test_a_command_is_given_the_options_as_text_besides_its_own():
     assert checked({"count": "4", "step_m": "many"}, Settings(count=5)) == Settings(count=4)
 
 
-@pytest.mark.parametrize("word, value", [("true", True), ("1", True), ("false", False), ("False", False),
-                                         ("no", False), ("0", False)])
-def test_booleans_parse_as_booleans(word, value):
-    assert checked({"loud": word}, Settings()).loud is value
-
-
 @pytest.mark.parametrize("given, parts", [
     ({"count": "0"}, ("--count 0", "a whole number ≥ 1, ≤ 9")), ({"count": "2.5"}, ("--count 2.5", "a whole number")),
     ({"share": "many"}, ("--share many", "a number > 0")), ({"loud": "perhaps"}, ("--loud perhaps", "true|false"))])

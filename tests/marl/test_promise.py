@@ -12,7 +12,7 @@ from marl.plan_flights import PlanSettings, planned_scene
 from marl.planner import PlanPolicy
 from marl.promise import Size, bases, promise, sized, sizes, smallest
 from marl.worlds import WorldSource, draw_positions
-from radiotwin import fit_twin, fly_survey, segmented_truth
+from radiotwin import fit_twin, fly_survey
 from radiotwin.errors import BadInput
 
 
@@ -119,14 +119,3 @@ def test_who_flies_and_what_waits_is_as_asked(small_scene, learnt, tmp_path):
         table.write_text(text)
         with pytest.raises(BadInput, match=message):
             planned_scene(small_scene, learnt, PlanSettings(data=table))
-
-
-def test_declared_volumes_of_devices_are_those_of_the_mission(small_scene):
-    config = small_scene.config
-    devices = [device.model_copy(update={"data_units": 100.0 * (number + 1)} if number else {})
-               for number, device in enumerate(config.devices)]
-    from dataclasses import replace
-
-    scene = replace(small_scene, config=config.model_copy(update={"devices": devices}))
-    mission = make_mission(scene, segmented_truth(small_scene), Known.truth(small_scene))
-    assert mission.data_units[1] == 200.0 and mission.data_units[0] == config.mission.data_units

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 import torch
 
-from marl.algorithm1 import Campaign, resumed, run_algorithm
+from marl.algorithm1 import Campaign, resume_from, run_algorithm
 from marl.checkpoint import Damaged, load_checkpoint, require_log, save_checkpoint
 from marl.learner import make_learner
 from marl.mission import Known, make_mission
@@ -98,7 +98,7 @@ def test_every_part_that_is_wrong_is_one_message(small_scene, stopped, tmp_path,
             monkeypatch.setattr("marl.algorithm1.load_checkpoint", lambda path, content=content: content)
             number = isinstance(at(state, path), int | float) and isinstance(new, int | float)
             try:
-                resumed(Campaign(RUN, small_scene, truth), learner, tmp_path / NAME)
+                resume_from(tmp_path / NAME, Campaign(RUN, small_scene, truth), learner)
             except BadInput as error:
                 assert "checkpoint" in str(error) and len(str(error)) < 1000
                 known += 1
