@@ -17,7 +17,7 @@ from radiotwin.errors import BadInput
 from radiotwin.importing.log_files import Lines, LogFile
 from radiotwin.importing.read_source import Expected, WithoutHeader
 from radiotwin.importing.settings import Settings
-from radiotwin.importing.source import columns_of
+from radiotwin.importing.source import Source, columns_of
 from radiotwin.io.budgets import CELLS, COLUMNS, ROWS
 
 _FIRST = 6  # fields before the bins
@@ -41,7 +41,7 @@ _MIXED = ("levels are RSRP of LTE and NR, RSCP of UMTS, RSSI of GSM: they differ
           "10 dB and are no one quantity; keep one with --only {}=LTE")
 
 
-def _read_rtl_power(file: LogFile, settings: Settings) -> tuple[pd.DataFrame, np.ndarray]:
+def _read_rtl_power(file: LogFile, settings: Settings) -> Source:
     """Sum the power [dB] of each sweep of rtl_power, in the band of the settings or in all bins.
 
     Bins with their centre in the band count. If bins are wider than the band, the bin with the
@@ -49,7 +49,7 @@ def _read_rtl_power(file: LogFile, settings: Settings) -> tuple[pd.DataFrame, np
 
     Returns:
         texts `date, time, band, power_db, bins`, with `power_db` empty if a sweep does not cover
-        the band; and the first line of each sweep.
+        the band.
     """
     band_hz = settings.band_hz
     sweeps: list[list[str]] = []
@@ -107,7 +107,7 @@ def _read_rtl_power(file: LogFile, settings: Settings) -> tuple[pd.DataFrame, np
                        f"{all_hz[0] / 1e6:.6g} to {all_hz[1] / 1e6:.6g} MHz")
     table = pd.DataFrame([[date, time, name, level, count] for date, time, level, count in sweeps],
                          columns=["date", "time", "band", "power_db", "bins"], dtype=str)
-    return table, np.array(numbers, dtype=np.int64)
+    return Source(str(file), table, lambda index: f"line {numbers[index]}")
 
 
 def _bins(file: LogFile, number: int, fields: list[str]) -> tuple[np.ndarray, np.ndarray, float]:

@@ -156,7 +156,7 @@ def starts_json(line: str) -> bool:
 
 
 def read_json_log(file: LogFile, declared: Collection[str], may_be: Collection[str],
-                  chosen: str | None, crs: str | None, bad_rows: BadRows | None) -> Source:
+                  chosen: str | None, crs: str | None, bad_rows: BadRows) -> Source:
     """Read the records of a JSON document, or of JSON lines.
 
     Args:
@@ -168,7 +168,7 @@ def read_json_log(file: LogFile, declared: Collection[str], may_be: Collection[s
         chosen: name, or end of the name, of the only list whose objects become rows; None: see
             above.
         crs: reference system of the coordinates of features, if the file declares none.
-        bad_rows: where lines that are no JSON are noted; None: they raise BadInput.
+        bad_rows: where lines that are no JSON are noted.
 
     Returns:
         the cells as texts, `""` for null, a missing value, and a list that is not read.
@@ -185,7 +185,7 @@ def read_json_log(file: LogFile, declared: Collection[str], may_be: Collection[s
 
 
 def _read(file: LogFile, used: Collection[str], chosen: str | None, crs: str | None,
-          bad_rows: BadRows | None) -> Source:
+          bad_rows: BadRows) -> Source:
     """Read the records of a file; objects in lists with a used column become rows of their own."""
     table = _Table(file, used, chosen, crs)
     try:
@@ -212,7 +212,7 @@ def _has_lines(file: LogFile) -> bool:
 
 
 def _add_lines(file: LogFile, table: _Table,
-               bad_rows: BadRows | None) -> list[tuple[str, int, str]]:
+               bad_rows: BadRows) -> list[tuple[str, int, str]]:
     """Add the records of JSON lines to a table; return reason, number and first of bad lines.
 
     Bad are lines that are no JSON object, as far as `bad_rows` allows; else BadInput.
@@ -231,14 +231,12 @@ def _add_lines(file: LogFile, table: _Table,
             before = before.strip() if brace and not before.startswith("[") else ""
             try:
                 record = parse_json(line[len(before):], where, allow_nan=True)
-                if before and isinstance(record, dict):
-                    record = {BEFORE: before} | record
                 if not isinstance(record, dict):
                     raise BadInput(f"{where} is no JSON object; allowed is one object a line")
+                if before:
+                    record = {BEFORE: before} | record
             except BadInput as error:
-                if bad_rows is None:
-                    raise
-                if not is_whole and not line.endswith("}"):  # the last one
+                if bad_rows.limit >= 0 and not is_whole and not line.endswith("}"):  # the last one
                     cut = [("row was cut off", 1, f"line {lines.number}")]
                     continue
                 if not bad_rows.add(f"{bad_rows.prefix}line {lines.number}", "", line[:80],
@@ -251,7 +249,7 @@ def _add_lines(file: LogFile, table: _Table,
 
 
 def _add_document(file: LogFile, table: _Table,
-                  bad_rows: BadRows | None) -> tuple[bool, list[tuple[str, int, str]]]:
+                  bad_rows: BadRows) -> tuple[bool, list[tuple[str, int, str]]]:
     """Add the records of all JSON documents in a file to a table.
 
     Returned are whether they are GeoJSON features, and reason, number and first one of bad records.
@@ -286,8 +284,6 @@ def _add_document(file: LogFile, table: _Table,
                     raise BadInput(f"{where} is {cell_text(record)}; allowed are objects")
                 row = _point_record(record, where) if is_map else record
             except BadInput as error:
-                if bad_rows is None:
-                    raise
                 if not bad_rows.add(f"{bad_rows.prefix}{noun} {number}", "", record,
                                     "is no point" if is_map else "is no object"):
                     raise BadInput(f"{error}{bad_rows.hint(1)}") from None

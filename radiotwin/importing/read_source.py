@@ -48,12 +48,12 @@ class WithoutHeader:
     Attributes:
         first_line: regular expression of the whole first line.
         names: of the columns.
-        read: reader that returns cells and the line of each row; None: a table with these columns.
+        read: reader; None: of a table with these columns.
     """
 
     first_line: str
     names: tuple[str, ...] = ()
-    read: Callable[[LogFile, Settings], tuple[pd.DataFrame, np.ndarray]] | None = None
+    read: Callable[[LogFile, Settings], Source] | None = None
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def _read_sheets(file: LogFile, declared: str | None) -> Iterator[tuple[str, She
 
 
 def _read_workbook(file: LogFile, settings: Settings, expected: Expected,
-                   bad_rows: BadRows | None) -> Source:
+                   bad_rows: BadRows) -> Source:
     """Read the sheets of a workbook that belong together, as one table.
 
     They are those with the declared columns, else those with the columns of the first sheet; or the
@@ -111,9 +111,9 @@ def _read_workbook(file: LogFile, settings: Settings, expected: Expected,
     settings = settings.model_copy(update={"delimiter": ","})
     sources: dict[str, Source] = {}
     failed: dict[str, BadInput] = {}
-    prefix = bad_rows.prefix if bad_rows is not None else ""
+    prefix = bad_rows.prefix
     for name, sheet in _read_sheets(file, settings.sheet):
-        if bad_rows is not None and settings.sheet is None:
+        if settings.sheet is None:
             bad_rows.prefix = f"{prefix}sheet {name}: "
         try:
             source = _read_text(sheet, settings, expected, bad_rows)
@@ -121,8 +121,7 @@ def _read_workbook(file: LogFile, settings: Settings, expected: Expected,
                 sources[name] = source
         except BadInput as error:  # as of one without a table
             failed[name] = error
-    if bad_rows is not None:
-        bad_rows.prefix = prefix
+    bad_rows.prefix = prefix
     if not sources:
         raise next(iter(failed.values()), BadInput(f"{file}: has no rows; it needs at least one "
                                                    "measurement"))
@@ -224,19 +223,20 @@ def read_source(file: LogFile | Path | str, settings: Settings | None = None,
         file: in a format of `log_files`.
         settings: declared properties of the text; others are detected.
         expected: columns that help to find the header.
-        bad_rows: where bad rows are noted, see `Source`; None: they are refused.
+        bad_rows: where bad rows are noted; None: they are refused.
 
     Raises:
         BadInput: unknown format, unreadable, or without rows.
     """
     if not isinstance(file, LogFile):
         file = LogFile(Path(file), Path(file).name)
+    settings, bad_rows = settings or Settings(), bad_rows or BadRows()
     if file.suffix == ".parquet":
         source = Source(file.path, read_cells(file.path), lambda index: f"row {index + 1}")
     elif file.suffix == ".xlsx" and file.member is None:
-        source = _read_workbook(file, settings or Settings(), expected, bad_rows)
+        source = _read_workbook(file, settings, expected, bad_rows)
     elif file.suffix in TEXTS:
-        source = _read_text(file, settings or Settings(), expected, bad_rows)
+        source = _read_text(file, settings, expected, bad_rows)
     else:
         raise BadInput(f"{file}: unknown format; allowed are {', '.join((*TEXTS, *BINARIES))}, and "
                        "the first ones with .gz")
@@ -246,7 +246,7 @@ def read_source(file: LogFile | Path | str, settings: Settings | None = None,
 
 
 def _read_text(file: LogFile, settings: Settings, expected: Expected,
-               bad_rows: BadRows | None) -> Source:
+               bad_rows: BadRows) -> Source:
     """Read a text file: JSON, a format without a header, or a table; plain CSV by pandas."""
     first = _first_line(file)
     kind = next((each for each in expected.without_header
@@ -256,23 +256,16 @@ def _read_text(file: LogFile, settings: Settings, expected: Expected,
         return read_json_log(file, declared, frozenset().union(*may_be), settings.list_name,
                              settings.crs, bad_rows)
     if kind is not None and kind.read is not None:
-        table, lines = kind.read(file, settings)
-    else:
-        names = settings.header or (list(kind.names) if kind is not None else [])
-        dialect = find_dialect(file, settings, expected.columns, names)
-        description = dialect.described()
-        plain = dialect.quotes and not (description or dialect.has_comments)
-        if plain and file.member is None and file.suffix == ".csv":
-            with suppress(RaggedRows):
-                cells = read_cells(file.path)
-                if not has_other_lines(cells):
-                    return Source(file.path, cells, lambda index: f"row {index + 2}")
-        text = read_text_table(file, dialect, bad_rows)
-        notes = (*(f"{file.name}: {description}",) * bool(description), *text.notes)
-        left_out = (("bad row", len(text.bad), f"line {text.bad[0]}"),) if text.bad else ()
-        return Source(str(file), text.cells, lambda index: f"line {text.lines[index]}", notes,
-                      text.fields, left_out)
-    return Source(str(file), table, lambda index: f"line {lines[index]}")
+        return kind.read(file, settings)
+    names = settings.header or (list(kind.names) if kind is not None else [])
+    dialect = find_dialect(file, settings, expected.columns, names)
+    plain = dialect.quotes and not (dialect.described() or dialect.has_comments)
+    if plain and file.member is None and file.suffix == ".csv":
+        with suppress(RaggedRows):
+            cells = read_cells(file.path)
+            if not has_other_lines(cells):
+                return Source(file.path, cells, lambda index: f"row {index + 2}")
+    return read_text_table(file, dialect, bad_rows)
 
 
 def _first_line(file: LogFile) -> str:

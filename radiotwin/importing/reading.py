@@ -101,9 +101,8 @@ def build_links(source: Source, settings: Settings, tally: Tally, problems: Prob
         tally.notes += [note] * bool(note)
         if columns["flight"] == BY_DAY:
             shared["flight"] = calendar_days(shared["time_s"].to_numpy(), settings.time_zone)
-    bad_rows = source.bad_rows or BadRows()
     if not problems:
-        shared = bad_rows.drop_noted(shared, tally, len(levels), source.where)
+        shared = source.bad_rows.drop_noted(shared, tally, len(levels), source.where)
         source = source.select(source.table.index.isin(shared.index))
     ROWS.check(len(source) * len(levels), f"{source.path}: rows times columns of levels")
     parts = []
@@ -213,11 +212,8 @@ def _rows_as_links(source: Source, level: LevelColumn, shared: pd.DataFrame, set
     offset_db: float | np.ndarray = settings.level_offset_db + level.offset_db
     if "snr" in links:  # below the noise, RSSI is that of the noise (Semtech, SX1276, 5.5.5)
         offset_db = offset_db + np.minimum(links.pop("snr").fillna(0.0).to_numpy(), 0.0)
-    levels = read_levels(source, level.spec, settings, offset_db)
-    links["level_db"] = levels.db
-    links["reason"] = np.select([levels.not_measured, levels.impossible],
-                                ["not measured", "impossible level"], "")
-    links = (source.bad_rows or BadRows()).drop_noted(links, tally, 1, source.where)
+    links["level_db"], links["reason"] = read_levels(source, level.spec, settings, offset_db)
+    links = source.bad_rows.drop_noted(links, tally, 1, source.where)
     for reason in ("not measured", "impossible level"):
         links = tally.drop(links, links["reason"] == reason, reason, level.spec, source.where)
     links = links.drop(columns="reason")
@@ -366,7 +362,7 @@ def _drop_impossible_degrees(source: Source, links: pd.DataFrame, prefix: str, n
         hint = "; are latitude and longitude swapped in the mapping?" if swapped else ""
         source.refuse(spec, links[prefix + name], bad,
                       f"is no {name}; allowed are -{limit:g} to {limit:g} degrees{hint}")
-        return (source.bad_rows or BadRows()).drop_noted(links, tally, 1, source.where)
+        return source.bad_rows.drop_noted(links, tally, 1, source.where)
     return tally.drop(links, bad, f"no {name} (beyond {limit:g}°)", spec, source.where)
 
 
@@ -540,7 +536,7 @@ def _drop_truncated_rows(source: Source, settings: Settings) -> Source:
     if not len(cut):
         return source
     first, count = int(cut[0]), source.fields[int(cut[0])]
-    bad_rows = source.bad_rows or BadRows()
+    bad_rows = source.bad_rows
     if are_few(len(cut), len(source)):
         reason = "row was cut off"
     elif all(bad_rows.add(source.where(row), "", f"{source.fields[row]} fields", "was cut off")

@@ -39,13 +39,13 @@ class BadRows:
     """Unreadable rows that are left out, as far as the user allows.
 
     Attributes:
-        limit: allowed number in all files, `skip_bad_rows`.
+        limit: allowed number in all files, `skip_bad_rows`; -1: of files that have no such option.
         prefix: of places in the present file: its name if there are several.
         rows: place, column, cell and reason of each row that is left out.
         fresh: index -> column of the rows that `note_rows` noted since the last `drop_noted`.
     """
 
-    limit: int = 0
+    limit: int = -1
     prefix: str = ""
     rows: dict[str, dict[str, str]] = field(default_factory=dict)
     fresh: dict[int, str] = field(default_factory=dict)
@@ -71,8 +71,9 @@ class BadRows:
         return True
 
     def hint(self, number: int) -> str:
-        """Return the end of a message: the option that leaves out `number` more rows."""
-        return f"; --skip-bad-rows {len(self.rows) + number} leaves such rows out"
+        """Return the end of a message: the option, if any, that leaves out `number` more rows."""
+        option = f"; --skip-bad-rows {len(self.rows) + number} leaves such rows out"
+        return option if self.limit >= 0 else ""
 
     def drop_noted(self, links: pd.DataFrame, tally: "Tally", readings: int,
                    where: Callable[[int], str]) -> pd.DataFrame:
@@ -99,7 +100,7 @@ class Source:
         notes: on how the file was read.
         fields: index -> number of fields, for rows with fewer fields than the header.
         left_out: rows that are not in the table: reason, number, and the first one.
-        bad_rows: where unreadable cells are noted; None: they raise BadInput.
+        bad_rows: where unreadable cells are noted.
     """
 
     path: Path | str
@@ -108,7 +109,7 @@ class Source:
     notes: tuple[str, ...] = ()
     fields: Mapping[int, int] = field(default_factory=dict)
     left_out: tuple[tuple[str, int, str], ...] = ()
-    bad_rows: BadRows | None = None
+    bad_rows: BadRows = field(default_factory=BadRows)
 
     def __len__(self) -> int:
         return len(self.table)
@@ -206,11 +207,10 @@ class Source:
         if spec in self.table:  # as in the file, where `N/A` is an empty cell
             texts = self.table[spec].reindex(cells.index)
             cells = texts.where(texts.map(lambda cell: isinstance(cell, str)), cells)
-        if self.bad_rows is not None:
-            if self.bad_rows.note_rows(self, spec, cells, rows, reason):
-                return
-            if len(rows) < len(cells) / 2:  # else it is not the rows that are wrong
-                reason += self.bad_rows.hint(len(rows))
+        if self.bad_rows.note_rows(self, spec, cells, rows, reason):
+            return
+        if len(rows) < len(cells) / 2:  # else it is not the rows that are wrong
+            reason += self.bad_rows.hint(len(rows))
         refuse(self.path, spec, cells, bad, reason, lambda row: self.where(cells.index[row]))
 
 

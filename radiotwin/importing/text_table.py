@@ -16,7 +16,7 @@ import pandas as pd
 from radiotwin.errors import BadInput
 from radiotwin.importing.log_files import Lines, LogFile, Sheet
 from radiotwin.importing.settings import BLANKS, DELIMITERS, Settings
-from radiotwin.importing.source import BadRows
+from radiotwin.importing.source import BadRows, Source
 from radiotwin.io.budgets import CELLS, COLUMNS, ROW_BYTES, ROWS
 from radiotwin.io.cells import EMPTY, cell_text
 from radiotwin.io.texts import unescape_formula, unescape_formulas
@@ -333,33 +333,14 @@ def _trailer(lines: list[str], delimiter: str, header: list[str], lengths: set[i
     return 0  # no row is left: reading raises BadInput
 
 
-@dataclass(frozen=True)
-class TextTable:
-    """Cells of a table as texts, `""`: empty, with decimal points.
-
-    Attributes:
-        cells: n rows.
-        lines: (n,) line of each row, from 1.
-        fields: row -> number of fields, for rows with fewer fields than the header.
-        notes: on skipped lines.
-        bad: lines of rows with too many fields, which were left out.
-    """
-
-    cells: pd.DataFrame
-    lines: np.ndarray
-    fields: dict[int, int]
-    notes: tuple[str, ...]
-    bad: list[int]
-
-
-def read_text_table(file: LogFile, dialect: Dialect, bad_rows: BadRows | None) -> TextTable:
-    """Read the rows of a text file, written in a known dialect, as a table of texts.
+def read_text_table(file: LogFile, dialect: Dialect, bad_rows: BadRows) -> Source:
+    """Read the rows of a text file as a table of texts with decimal points, `""`: empty.
 
     Args:
         file: of text.
         dialect: of the text.
-        bad_rows: notes rows with too many fields, and rows with too few are filled up; None: both
-            raise BadInput.
+        bad_rows: notes rows with too many fields, and rows with too few are filled up; without a
+            limit both raise BadInput.
 
     Raises:
         BadInput: no header, a repeated name, or a row with too few or too many fields.
@@ -404,7 +385,7 @@ def _rows(reader: Iterator[list[str]], lines: _QuotedLines) -> Iterator[list[str
 
 
 def _read(file: LogFile, dialect: Dialect, reader: Iterator[list[str]],
-          lines: Lines, bad_rows: BadRows | None) -> TextTable:
+          lines: Lines, bad_rows: BadRows) -> Source:
     """Read the header and the rows from a CSV reader, without comments and repeated headers."""
     names = list(dialect.names)
     if not names:
@@ -433,13 +414,12 @@ def _read(file: LogFile, dialect: Dialect, reader: Iterator[list[str]],
             continue
         if len(row) != width and not fits(row, width):
             # With blanks as delimiters it is unknown which cell is missing.
-            if bad_rows is None or len(row) > width or dialect.delimiter in BLANKS:
-                if bad_rows is not None and bad_rows.add(
-                        f"{bad_rows.prefix}line {number}", "", f"{len(row)} fields",
-                        f"is not the {width} of the header"):
+            if bad_rows.limit < 0 or len(row) > width or dialect.delimiter in BLANKS:
+                if bad_rows.add(f"{bad_rows.prefix}line {number}", "", f"{len(row)} fields",
+                                f"is not the {width} of the header"):
                     bad.append(number)
                     continue
-                hint = "" if bad_rows is None else bad_rows.hint(1)
+                hint = bad_rows.hint(1)
                 if dialect.delimiter in BLANKS:
                     hint += "; where blanks are in a cell, --header names its parts"
                 raise BadInput(f"{file}: line {number} has {len(row)} fields, the header has "
@@ -460,8 +440,12 @@ def _read(file: LogFile, dialect: Dialect, reader: Iterator[list[str]],
     ROWS.check(total, file)
     notes = [f"{file.name}: {_lines(len(those), what)} left out, the first is line {those[0]}"
              for those, what in ((comments, "of comments"), (headers, "like the header")) if those]
-    return TextTable(pd.concat(chunks, ignore_index=True), np.array(numbers, dtype=np.int64), few,
-                     tuple(notes), bad)
+    if description := dialect.described():
+        notes.insert(0, f"{file.name}: {description}")
+    left_out = (("bad row", len(bad), f"line {bad[0]}"),) if bad else ()
+    line_of = np.array(numbers, dtype=np.int64)
+    return Source(str(file), pd.concat(chunks, ignore_index=True),
+                  lambda index: f"line {line_of[index]}", tuple(notes), few, left_out)
 
 
 def _without_last(reader: Iterator[list[str]], lines: Lines,

@@ -6,7 +6,6 @@ be at two places at once.
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
 from datetime import timedelta
 from zoneinfo import ZoneInfo, available_timezones
 
@@ -269,26 +268,13 @@ def in_metres(numbers: np.ndarray, unit: str | None, column: str) -> np.ndarray:
     return numbers * METRES[unit or "m"]
 
 
-@dataclass(frozen=True)
-class Levels:
-    """Levels of one column.
-
-    Attributes:
-        db: (n,) level [dBm, or dB for gains]; NaN: not detected, not measured, or impossible.
-        not_measured: (n,) bool.
-        impossible: (n,) bool, outside `POSSIBLE_DB`.
-    """
-
-    db: np.ndarray
-    not_measured: np.ndarray
-    impossible: np.ndarray
-
-
 def read_levels(source: Source, spec: str, settings: Settings,
-                offset_db: float | np.ndarray = 0.0) -> Levels:
+                offset_db: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Read the levels of one column [dB or dBm], and add an offset [dB], one for all or (n,).
 
-    NaN: not detected, not measured, or impossible; the result says which.
+    Returns:
+        levels (n,), NaN: not detected, or not to be used; and the reason for the latter (n,): `not
+        measured`, `impossible level` (outside `POSSIBLE_DB`), or `""`.
 
     Raises:
         BadInput: the unit is not declared, a cell is not a number, or the meaning of empty cells is
@@ -327,7 +313,7 @@ def read_levels(source: Source, spec: str, settings: Settings,
     impossible = ~not_measured & ~not_detected & ~((db > low) & (db < high))
     _refuse_uncalibrated(source, spec, db[~not_measured & ~not_detected], high)
     db = np.where(not_measured | not_detected | impossible, np.nan, db)
-    return Levels(db, not_measured, impossible)
+    return db, np.select([not_measured, impossible], ["not measured", "impossible level"], "")
 
 
 def _refuse_uncalibrated(source: Source, spec: str, db: np.ndarray, high_db: float) -> None:

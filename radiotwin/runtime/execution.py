@@ -24,7 +24,7 @@ from functools import partial
 from typing import Any, Generic
 
 from radiotwin.errors import BadInput, RunFailed
-from radiotwin.io.signals import deferred, kept_from_children
+from radiotwin.io.signals import kept_from_children
 from radiotwin.runtime.console import progress
 from radiotwin.runtime.jobs import (
     SHARE_ROUNDING,
@@ -313,18 +313,10 @@ def _gigabytes(count: int) -> str:
     return f"{count / 2**30:.1f} GiB"
 
 
-class LocalPool(Pool):
-    """Processes of this machine.
-
-    Args:
-        workers: their number; None: as many as cores and memory allow.
-    """
+class LocalPool(Pool["_LocalWorker"]):
+    """Processes of this machine: a number of them, or (None) as many as cores and memory allow."""
 
     name = "this machine"
-
-    def __init__(self, workers: int | None = None) -> None:
-        self._most = workers
-        self._workers: list[_LocalWorker] = []
 
     def prepare(self, function: bytes, resources: Resources, count: int) -> Sequence[Worker]:
         """Return workers for a job, at most `count`; running ones are used again, others ended.
@@ -349,7 +341,7 @@ class LocalPool(Pool):
             each.close()
         self._workers = reusable[:wanted]
         while len(self._workers) < wanted:
-            self._workers.append(_LocalWorker())
+            self._workers.append(_LocalWorker(resources))
         for each in self._workers:
             each.function, each.resources = function, resources
         return self._workers
@@ -361,13 +353,6 @@ class LocalPool(Pool):
             return max(self._most or 0, _cores() // resources.cores)
         # Present workers free their memory when they get the next job.
         return (free + sum(each.memory_bytes for each in self._workers)) // resources.memory_bytes
-
-    def close(self) -> None:
-        """End all workers."""
-        with deferred():
-            for each in self._workers:
-                each.close()
-            self._workers = []
 
 
 def _room_on_gpu(resources: Resources) -> int:
@@ -397,31 +382,22 @@ def start_process(environment: dict[str, str]) -> tuple[Any, "Future[int]"]:
 class _LocalWorker(Worker):
     """A process of this machine; it is killed if it exceeds its memory."""
 
-    def __init__(self) -> None:
-        self.function, self.resources = b"", Resources()
-        self._sent = b""
-        self._pool: Any = None
-        self._begun: Future[int] = Future()
-        self._over_memory = False
+    _begun: "Future[int]"
+    _over_memory = False
 
     @property
     def memory_bytes(self) -> int:
         """Present memory of the process."""
-        begun = self._begun.done() and self._begun.exception() is None
-        return resident_bytes(self._begun.result()) if begun else 0
+        if self.process is None or not self._begun.done() or self._begun.exception() is not None:
+            return 0
+        return resident_bytes(self._begun.result())
 
-    def submit(self, piece: Any) -> "Future[Outcome]":
-        """Run a piece in the worker's process, started if needed; send a new function with it."""
-        if self._pool is None:
-            self._start()
-        if self._sent == self.function:
-            return self._pool.submit(run_piece, piece)
-        self._sent = self.function
-        return self._pool.submit(run_piece, piece, self.function)
+    def start(self) -> None:
+        self._over_memory = False
+        self.process, self._begun = start_process(thread_variables(self.resources.cores))
 
-    def _start(self) -> None:
-        self._over_memory, self._sent = False, b""
-        self._pool, self._begun = start_process(thread_variables(self.resources.cores))
+    def run(self, *arguments: Any) -> "Future[Outcome]":
+        return self.process.submit(run_piece, *arguments)
 
     def death(self, error: BaseException) -> Death | None:
         """Return why the process died, if an error means that; None: an error of the function."""
@@ -437,9 +413,6 @@ class _LocalWorker(Worker):
         codes = str(error).partition("exit codes of the workers are ")[2].partition("\n")[0]
         return Death(codes.strip("{}") or "killed")
 
-    def raised(self, error: BaseException) -> BaseException:
-        return error
-
     def check(self) -> None:
         resources = self.resources
         if resources.is_bound and 0 < resources.memory_bytes < self.memory_bytes:
@@ -447,9 +420,9 @@ class _LocalWorker(Worker):
             os.kill(self._begun.result(), signal.SIGKILL)
 
     def close(self) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(wait=True, kill_workers=True)
-            self._pool, self._begun = None, Future()
+        if self.process is not None:
+            self.process.shutdown(wait=True, kill_workers=True)
+            self.process = None
 
 
 @contextmanager

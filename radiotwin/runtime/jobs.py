@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar
 
+from radiotwin.io.signals import deferred
 from radiotwin.runtime.processes import die_with_parent
 
 P = TypeVar("P")
@@ -187,30 +188,57 @@ class Death:
 
 
 class Worker(ABC):
-    """A process that runs one piece at a time; `submit` starts a new one after a death."""
+    """A process that runs one piece at a time.
+
+    Attributes:
+        function: of the present job, as it is sent to the process.
+        process: handle of the process; None: it is not started, or has died.
+    """
+
+    def __init__(self, resources: Resources) -> None:
+        self.resources = resources
+        self.function: Any = None
+        self.process: Any = None
+        self._sent: Any = None
+
+    def submit(self, piece: Any) -> "Future[Outcome]":
+        """Run a piece in the worker's process, started if needed; send a new function with it."""
+        if self.process is None:
+            self.start()
+            self._sent = None
+        if self._sent == self.function:
+            return self.run(piece)
+        self._sent = self.function
+        return self.run(piece, self.function)
 
     @abstractmethod
-    def submit(self, piece: Any) -> "Future[Outcome]":
-        """Start a piece of the job that the pool was last prepared for."""
+    def start(self) -> None:
+        """Start the process."""
+
+    @abstractmethod
+    def run(self, *arguments: Any) -> "Future[Outcome]":
+        """Call `PieceRunner.run` in the process."""
 
     @abstractmethod
     def death(self, error: BaseException) -> Death | None:
         """Return why the worker died; None if `error` was raised by the function."""
 
-    @abstractmethod
     def raised(self, error: BaseException) -> BaseException:
         """Return the error that the function raised, unwrapped from the backend's."""
+        return error
 
     @abstractmethod
     def close(self) -> None:
         """Kill the process."""
 
-    @abstractmethod
-    def check(self) -> None:
+    def check(self) -> None:  # noqa: B027  # Ray's own nodes do it
         """Kill the worker if it exceeds its memory."""
 
 
-class Pool(ABC):
+W = TypeVar("W", bound=Worker)
+
+
+class Pool(ABC, Generic[W]):
     """A set of workers.
 
     Attributes:
@@ -218,6 +246,10 @@ class Pool(ABC):
     """
 
     name: str
+
+    def __init__(self, workers: int | None = None) -> None:
+        self._most = workers
+        self._workers: list[W] = []
 
     @abstractmethod
     def prepare(self, function: bytes, resources: Resources, count: int) -> Sequence[Worker]:
@@ -235,6 +267,9 @@ class Pool(ABC):
             RunFailed: the requested workers do not fit on the machine.
         """
 
-    @abstractmethod
     def close(self) -> None:
         """Kill all workers."""
+        with deferred():
+            for each in self._workers:
+                each.close()
+            self._workers = []

@@ -59,7 +59,7 @@ finally:
 """
 
 
-class RayPool(Pool):
+class RayPool(Pool["_RayWorker"]):
     """Actors of a Ray cluster.
 
     Args:
@@ -74,8 +74,7 @@ class RayPool(Pool):
     name = "a Ray cluster"
 
     def __init__(self, address: str, workers: int | None = None) -> None:
-        self._most = workers
-        self._workers: list[_RayWorker] = []
+        super().__init__(workers)
         self._head: _Head | None = None
         if address == OWN:
             _require_token()
@@ -165,9 +164,7 @@ class RayPool(Pool):
     def close(self) -> None:
         """End all workers, and the cluster if it is our own."""
         with deferred():
-            for each in self._workers:
-                each.close()
-            self._workers = []
+            super().close()
             self._ray.shutdown()
             if self._head is not None:
                 self._head.close()
@@ -216,24 +213,18 @@ class _RayWorker(Worker):
     """An actor of a Ray cluster."""
 
     def __init__(self, ray: Any, resources: Resources) -> None:
-        self._ray, self.resources = ray, resources
-        self.function: Any = None
-        self._sent: Any = None
-        self._actor: Any = None
+        super().__init__(resources)
+        self._ray = ray
 
-    def submit(self, piece: Any) -> "Future[Outcome]":
-        """Run a piece in the worker's process, started if needed; send a new function with it."""
-        if self._actor is None:
-            resources = self.resources
-            self._actor = self._ray.remote(PieceRunner).options(
-                num_cpus=resources.cores, num_gpus=resources.gpu_share or None,
-                memory=resources.memory_bytes or None, max_restarts=0,
-                runtime_env={"env_vars": thread_variables(resources.cores)}).remote()
-            self._sent = None
-        if self._sent is self.function:
-            return self._actor.run.remote(piece).future()
-        self._sent = self.function
-        return self._actor.run.remote(piece, self.function).future()
+    def start(self) -> None:
+        resources = self.resources
+        self.process = self._ray.remote(PieceRunner).options(
+            num_cpus=resources.cores, num_gpus=resources.gpu_share or None,
+            memory=resources.memory_bytes or None, max_restarts=0,
+            runtime_env={"env_vars": thread_variables(resources.cores)}).remote()
+
+    def run(self, *arguments: Any) -> "Future[Outcome]":
+        return self.process.run.remote(*arguments).future()
 
     def death(self, error: BaseException) -> Death | None:
         """Return why the process died, if an error means that; None: an error of the function."""
@@ -250,13 +241,10 @@ class _RayWorker(Worker):
     def raised(self, error: BaseException) -> BaseException:
         return getattr(error, "cause", None) or error
 
-    def check(self) -> None:
-        """Do nothing: Ray kills workers if a node is short of memory."""
-
     def close(self) -> None:
-        if self._actor is not None:
-            self._ray.kill(self._actor)
-            self._actor = None
+        if self.process is not None:
+            self._ray.kill(self.process)
+            self.process = None
 
 
 @contextlib.contextmanager
