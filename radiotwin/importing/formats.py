@@ -44,12 +44,8 @@ _MIXED = ("levels are RSRP of LTE and NR, RSCP of UMTS, RSSI of GSM: they differ
 def _read_rtl_power(file: LogFile, settings: Settings) -> Source:
     """Sum the power [dB] of each sweep of rtl_power, in the band of the settings or in all bins.
 
-    Bins with their centre in the band count. If bins are wider than the band, the bin with the
-    band's middle counts, and the band is named after the edges of that bin.
-
-    Returns:
-        texts `date, time, band, power_db, bins`, with `power_db` empty if a sweep does not cover
-        the band.
+    Bins with their centre in the band count; of wider ones that with the band's middle, after
+    whose edges the band is named. `power_db` is empty if a sweep does not cover the band.
     """
     band_hz = settings.band_hz
     sweeps: list[list[str]] = []
@@ -184,10 +180,7 @@ def _plain(name: str) -> str:
 
 
 def _matching_column(name: str, actual: Mapping[str, str]) -> str:
-    """Return the column of a header for a name in which `*` is any text; `""` if there is none.
-
-    `actual` maps names in a plain form to those of the header; the first column counts.
-    """
+    """Return the first column, of plain -> actual name, that fits a name with `*`; or `""`."""
     if "*" not in name:
         return actual.get(name, "")
     pattern = re.compile(".*".join(map(re.escape, name.split("*"))))

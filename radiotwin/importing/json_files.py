@@ -94,10 +94,7 @@ class _Table:
                       left_out=tuple(left_out))
 
     def _rows(self, value: dict[str, Any], prefix: str) -> Iterator[tuple[dict[str, str], bool]]:
-        """Yield the rows of a record: one for each object in its lists, or one if it has none.
-
-        The second value tells whether the row is of such an object, as one reception of a message.
-        """
+        """Yield a row for each object in a record's lists, and True; or one row, and False."""
         flat: dict[str, str] = {}
         receptions: list[tuple[str, list[Any]]] = []
         self._flatten(value, prefix, flat, receptions)
@@ -186,7 +183,7 @@ def read_json_log(file: LogFile, declared: Collection[str], may_be: Collection[s
 
 def _read(file: LogFile, used: Collection[str], chosen: str | None, crs: str | None,
           bad_rows: BadRows) -> Source:
-    """Read the records of a file; objects in lists with a used column become rows of their own."""
+    """Read the records of a file once, see `read_json_log`."""
     table = _Table(file, used, chosen, crs)
     try:
         if _has_lines(file):
@@ -213,10 +210,7 @@ def _has_lines(file: LogFile) -> bool:
 
 def _add_lines(file: LogFile, table: _Table,
                bad_rows: BadRows) -> list[tuple[str, int, str]]:
-    """Add the records of JSON lines to a table; return reason, number and first of bad lines.
-
-    Bad are lines that are no JSON object, as far as `bad_rows` allows; else BadInput.
-    """
+    """Add the records of JSON lines to a table; return reason, number and first of bad lines."""
     bad: list[int] = []
     cut: list[tuple[str, int, str]] = []
     with file.open() as content, io.TextIOWrapper(content, "utf-8", newline="") as text:
@@ -250,10 +244,7 @@ def _add_lines(file: LogFile, table: _Table,
 
 def _add_document(file: LogFile, table: _Table,
                   bad_rows: BadRows) -> tuple[bool, list[tuple[str, int, str]]]:
-    """Add the records of all JSON documents in a file to a table.
-
-    Returned are whether they are GeoJSON features, and reason, number and first one of bad records.
-    """
+    """Add the records of JSON documents to a table; return whether they are features; bad ones."""
     is_map = False
     bad: list[tuple[str, int, str]] = []
     number = 0

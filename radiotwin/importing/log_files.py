@@ -87,11 +87,9 @@ class Sheet(LogFile):
 
 def list_files(paths: Iterable[Path | str],
                without: Iterable[Path | str]) -> tuple[list[LogFile], int]:
-    """List the files to import: in the order of `paths`, and by name in each.
+    """List the files to import, by name in each folder (with those in it) and zip file.
 
-    Args:
-        paths: files, folders (searched recursively), and zip files.
-        without: files and folders to skip, such as tables of positions and the output.
+    Files and folders of `without` are skipped, such as tables of positions and the output.
 
     Returns:
         the files, and the number of files of other formats in folders and zip files.

@@ -122,11 +122,7 @@ def _numbered_names(names: pd.Series, since_s: np.ndarray) -> pd.Series:
 
 
 def _names_by_time(source: Source, links: pd.DataFrame, table: pd.DataFrame | None) -> pd.DataFrame:
-    """Rename devices with several positions over time to `NAME@1`, …, by the time of each link.
-
-    The table has a row for each such name, with the times since and until when it holds. Where no
-    row holds, a link keeps the device's name.
-    """
+    """Rename devices with several positions over time to `NAME@1`, …, where a row's time holds."""
     if table is None or SINCE not in table:
         return links
     place_of = pd.Series(table.index, index=table.index)
@@ -187,14 +183,10 @@ def _names_by_place(source: Source, links: pd.DataFrame, device_m: np.ndarray,
 
 
 def _read_sites(path: str, key: str, settings: Settings, names: Collection[str]) -> SiteTable:
-    """Read a table of positions of devices or receivers.
+    """Read a table of positions by name, with projected x and y as latitude and longitude.
 
     Several rows of one device are its positions over time, with columns `since` and optionally
-    `until` in ISO 8601. They become devices `NAME@1`, `NAME@2`, …. `key` is `device` or `receiver`,
-    and `names` are those in the log.
-
-    Returns:
-        the table, indexed by name, with projected x and y as latitude and longitude.
+    `until` in ISO 8601. `key` is `device` or `receiver`, and `names` are those in the log.
     """
     source = read_source(path, expected=Expected(is_wanted=is_site_table))
     uses = [*DEVICE_OPTIONAL, "antenna", "since", "until"] if key == "device" else []
@@ -203,7 +195,12 @@ def _read_sites(path: str, key: str, settings: Settings, names: Collection[str])
     period: dict[str, np.ndarray] = {}
     unique = sites.names
     if "since" in sites.values:
-        period = _periods(source, sites, settings)
+        period = {SINCE: seconds(source, sites.columns["since"], ISO, settings.time_zone),
+                  UNTIL: np.full(len(source), np.nan)}
+        if "until" in sites.columns:
+            period[UNTIL] = seconds(source, sites.columns["until"], ISO, settings.time_zone)
+        sites.refuse("since", period[UNTIL] <= period[SINCE],
+                     "is not before the time until which the device was there")
         unique = _numbered_names(unique, period[SINCE])
     sites.refuse(key, unique.duplicated(), f"occurs twice; every {key} has one row")
     notes = [*source.notes, *sites.notes,
@@ -212,17 +209,6 @@ def _read_sites(path: str, key: str, settings: Settings, names: Collection[str])
                            settings.crs).assign(**period)
     return replace(sites, values=values.set_axis(pd.Index(unique, dtype=object)),
                    notes=tuple(notes))
-
-
-def _periods(source: Source, sites: SiteTable, settings: Settings) -> dict[str, np.ndarray]:
-    """Read since and until when a device was at each position [s since 1970]; NaN: not given."""
-    since_s = seconds(source, sites.columns["since"], ISO, settings.time_zone)
-    until_s = np.full(len(source), np.nan)
-    if "until" in sites.columns:
-        until_s = seconds(source, sites.columns["until"], ISO, settings.time_zone)
-    sites.refuse("since", until_s <= since_s,
-                 "is not before the time until which the device was there")
-    return {SINCE: since_s, UNTIL: until_s}
 
 
 @dataclass(frozen=True)
@@ -248,8 +234,8 @@ class PositionedLinks:
         """Select links by a mask (n,), and their devices."""
         links = self.links[keep]
         devices = self.devices[self.devices["device"].isin(links["device"])]
-        return PositionedLinks(links, devices.reset_index(drop=True), self.device_m[keep],
-                               self.origin, self.notes)
+        return replace(self, links=links, devices=devices.reset_index(drop=True),
+                       device_m=self.device_m[keep])
 
 
 def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
@@ -307,10 +293,9 @@ def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
 
 
 def _placeholder_fixes(receivers: pd.DataFrame, names: pd.Series) -> dict[str, np.ndarray]:
-    """Find placeholder positions that a program wrote in place of a missing fix.
+    """Find placeholders of missing fixes: position as text -> rows of its readings.
 
     Such a position repeats to the last digit, far from the middle of a moving receiver's positions.
-    Returned are position as text -> rows of its readings.
     """
     if "latitude" not in receivers:
         return {}
@@ -352,12 +337,9 @@ def _far_notes(source: Source, links: pd.DataFrame, receivers: pd.DataFrame,
 
 
 def _split_by_band(links: pd.DataFrame) -> tuple[pd.DataFrame, dict[str, str], list[str]]:
-    """Split devices that are read on carriers of several bands into one device for each band.
+    """Split devices that are read on carriers of several bands, whose levels and antennas differ.
 
-    Their levels and antennas differ. Channels of one band, between which a device hops, stay one.
-
-    Returns:
-        the links; new name -> old name; and a note.
+    Channels of one band stay one device. Returned are the links, new -> old name, and a note.
     """
     if "frequency_hz" not in links:
         return links, {}, []

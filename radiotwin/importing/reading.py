@@ -68,14 +68,7 @@ class LevelColumn:
 
 def build_links(source: Source, settings: Settings, tally: Tally, problems: Problems,
                 file_name: str) -> tuple[pd.DataFrame, int]:
-    """Convert the rows of a file to links.
-
-    Args:
-        source: the file.
-        settings: for this file.
-        tally: counts readings that are left out.
-        problems: collects all errors; if there are any, the result is incomplete.
-        file_name: for quantities that are taken from the file's name.
+    """Convert the rows of a file to links; with any `problems` the result is incomplete.
 
     Returns:
         links in the order of the file, with the index of the source, and the number of readings per
@@ -120,11 +113,7 @@ def build_links(source: Source, settings: Settings, tally: Tally, problems: Prob
 def _from_file_name(source: Source, name: str, spec: str, file_name: str) -> str:
     """Replace `by file` and `{file date}` in a mapping's entry by what the file name says.
 
-    `by file` is the whole name, for a device, receiver or flight, else the number with a unit in
-    it.
-
-    Raises:
-        BadInput: the file name contains none, or two.
+    `by file` is the whole name, for names, else the one number with a unit in it, or BadInput.
     """
     if spec == BY_FILE and name in NAMES:
         return f"{ALWAYS}{file_name}"
@@ -189,11 +178,7 @@ def _row_columns(source: Source, columns: dict[str, str], settings: Settings,
 
 def _rows_as_links(source: Source, level: LevelColumn, shared: pd.DataFrame, settings: Settings,
               tally: Tally) -> pd.DataFrame:
-    """Make a link of each row's level in one column; unusable ones are counted and dropped.
-
-    Those are levels not measured or impossible, and links without a name, a valid position or a
-    possible height. `shared` are the columns that belong to all columns of levels.
-    """
+    """Make a link of each row's level in one column; unusable ones are counted and dropped."""
     links = shared.copy(deep=False)  # columns are added and replaced, never changed in place
     for name, spec in level.own.items():
         if name not in NAMES:
@@ -335,13 +320,9 @@ def _naming_notes(source: Source, settings: Settings) -> list[str]:
 
 def _match(pattern: str, name: str) -> str | None:
     """Return the text that `*` stands for in a name, or the name without `*`; None: no match."""
-    if "*" not in pattern:
-        return name if name == pattern else None
-    before, after = pattern.split("*", 1)
-    if len(name) < len(before) + len(after):
-        return None
-    fits = name.startswith(before) and name.endswith(after)
-    return name[len(before):len(name) - len(after)] if fits else None
+    before, star, after = map(re.escape, pattern.partition("*"))
+    found = re.fullmatch(f"{before}(.*){after}" if star else f"({before})", name, re.DOTALL)
+    return found[1] if found else None
 
 
 def _column_name(settings: Settings, level: LevelColumn, name: str) -> str:
@@ -374,22 +355,18 @@ class Logs:
         source: all files, for messages only.
         links: of all files, see `build_links`.
         level_column: of `measurements.csv`.
-        rows: of all files.
-        readings: in these rows.
+        readings: of all files.
         files: name, rows, readings, format and unused columns of each file, for the report.
         notes: on how files were read.
-        format: of all files, or None.
         bad_rows: unreadable rows that were left out, see `BadRows.rows`.
     """
 
     source: Source
     links: pd.DataFrame
     level_column: str
-    rows: int
     readings: int
     files: list[dict[str, Any]]
     notes: list[str]
-    format: str | None
     bad_rows: list[dict[str, str]]
 
 
@@ -405,7 +382,7 @@ def read_logs(files: list[LogFile], settings: Settings, tally: Tally,
     records: list[dict[str, Any]] = []
     wheres: list[tuple[int, Callable[[int], str]]] = []
     level_column = ""
-    formats, notes = set(), []
+    notes: list[str] = []
     rows = 0
     may_be = expected([format_named(settings.format)] if settings.format else FORMATS,
                       _declared_columns(settings))
@@ -431,7 +408,6 @@ def read_logs(files: list[LogFile], settings: Settings, tally: Tally,
             if file_settings.read_at == "device":
                 links[READS] = 1.0
             parts.append(links)
-            formats.add(format_name)
             level_column = LEVEL_COLUMN[str(file_settings.level_unit)]  # one for all files
             records.append({"file": file.name, "rows": count, "readings": count * per_row,
                             "format": format_name, "not_used": _unused(source, file_settings)})
@@ -450,10 +426,8 @@ def read_logs(files: list[LogFile], settings: Settings, tally: Tally,
     whole = Source(str(label), links.iloc[:0], where)
     if len(files) > 1:
         links = _without_copies(whole, links, starts, tally)
-    return Logs(whole, links, level_column, sum(record["rows"] for record in records),
-                sum(record["readings"] for record in records), records,
-                list(dict.fromkeys([*notes, *tally.notes])),
-                formats.pop() if len(formats) == 1 else None, list(bad_rows.rows.values()))
+    return Logs(whole, links, level_column, sum(record["readings"] for record in records), records,
+                list(dict.fromkeys([*notes, *tally.notes])), list(bad_rows.rows.values()))
 
 
 def _unused(source: Source, settings: Settings) -> list[str]:
@@ -516,9 +490,8 @@ def _renumbered(source: Source, first: int, prefix: str) -> Source:
 def _drop_truncated_rows(source: Source, settings: Settings) -> Source:
     """Drop rows that were cut off before the last used column; BadInput if there are many.
 
-    Short rows with all used columns stay, with a note: programs omit empty last cells. But a row
-    that ends with a used column, and is the only one of its length, may be cut off within that
-    cell.
+    Short rows with all used columns stay: programs omit empty last cells. But the only row of its
+    length, if it ends with a used column, may be cut off within that cell.
     """
     header = list(map(str, source.table))
     specs = settings.columns.model_dump(exclude_none=True).values()

@@ -10,7 +10,6 @@ from typing import Literal
 
 import numpy as np
 import pandas as pd
-from scipy.constants import speed_of_light
 
 from radiotwin.importing.source import Source
 from radiotwin.importing.tracks.fixes import ANGLES
@@ -53,11 +52,6 @@ def average(links: pd.DataFrame, length_m: float,
     means["level_db"] = _level(links["level_db"].to_numpy(), bin_index, count, method)
     bins = links.iloc[first].reset_index(drop=True)
     return bins.assign(**means, quality=count.astype(float))
-
-
-def in_wavelengths(length_m: float, frequency_hz: float) -> float:
-    """Convert a length [m] to wavelengths."""
-    return length_m * frequency_hz / speed_of_light
 
 
 def _in_track_order(links: pd.DataFrame, track: np.ndarray) -> tuple[pd.DataFrame, np.ndarray]:
@@ -112,8 +106,7 @@ def _level(level_db: np.ndarray, bin_index: np.ndarray, count: np.ndarray,
            method: str) -> np.ndarray:
     """Return the level of each bin [dB]: mean power, or with the `method` median the median.
 
-    `bin_index` (n,) is the bin of each level, and `count` the number in each bin. A bin with more
-    than half its levels NaN (not detected) is NaN; else these count as zero power (-inf dB).
+    Levels not detected (NaN) count as zero power (-inf dB); with more than half a bin is NaN, too.
     """
     missed = np.isnan(level_db)
     if method == "power":
@@ -149,10 +142,7 @@ def stay_representatives(links: pd.DataFrame, distance_m: float) -> np.ndarray:
 
 
 def _stays(position_m: np.ndarray, track: np.ndarray, distance_m: float) -> np.ndarray:
-    """Return the stay of each reading, an index (n,), of readings in the order of time.
-
-    A stay ends where the track does, or farther than `distance_m` from its first position.
-    """
+    """Return the stay of each reading, an index (n,), of readings in the order of time."""
     stay = np.empty(len(track), dtype=np.int64)
     number, current, limit_m2 = -1, None, distance_m**2
     x0 = y0 = z0 = 0.0

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.constants import speed_of_light
 
 from radiotwin.display import some
 from radiotwin.errors import BadInput
@@ -17,7 +18,7 @@ from radiotwin.geo import FRAME_FILE
 from radiotwin.importing.log_files import list_files
 from radiotwin.importing.positions import PositionedLinks, add_positions
 from radiotwin.importing.reading import Logs, read_logs
-from radiotwin.importing.repeats import WAVELENGTHS, average, in_wavelengths, stay_representatives
+from radiotwin.importing.repeats import WAVELENGTHS, average, stay_representatives
 from radiotwin.importing.settings import Settings, read_settings, write_settings
 from radiotwin.importing.source import Source, Tally
 from radiotwin.importing.tracks import add_tracks
@@ -62,7 +63,7 @@ def _make_report(logs: Logs, notes: list[str], others: int, kept: int, tally: Ta
     time_s = table["time_s"].dropna() if "time_s" in table else pd.Series(dtype=float)
     return {
         "schema": SCHEMA, "files": logs.files,
-        "rows": logs.rows, "readings": logs.readings, "kept": kept,
+        "rows": sum(each["rows"] for each in logs.files), "readings": logs.readings, "kept": kept,
         "left_out": [{"reason": reason, "column": column, "readings": number,
                       "first": tally.first[reason, column]}
                      for (reason, column), number in tally.left_out.items()],
@@ -184,7 +185,7 @@ def _averaging_warnings(measurements: Measurements, settings: Settings) -> Itera
     """Warn about a length of averaging outside of `WAVELENGTHS` (Lee 1985)."""
     if settings.average_m and "frequency_hz" in measurements.devices:
         frequency_hz = measurements.devices["frequency_hz"].median()
-        length = in_wavelengths(settings.average_m, frequency_hz)
+        length = settings.average_m * frequency_hz / speed_of_light
         if not WAVELENGTHS[0] <= length <= WAVELENGTHS[1]:
             low_m, high_m = (number * settings.average_m / length for number in WAVELENGTHS)
             yield (f"average_m = {settings.average_m:g} is {length:.0f} wavelengths; "
@@ -249,8 +250,10 @@ def import_files(paths: Path | str | Sequence[Path | str], settings: Settings, o
     report = _make_report(logs, [*logs.notes, *notes, *positioned.notes], others, kept, tally,
                          positioned, measurements, settings)
     on_progress("writing")
-    used = settings.model_copy(update={"origin": positioned.origin,
-                                       "format": settings.format or logs.format})
+    formats = {each["format"] for each in logs.files}
+    used = settings.model_copy(update={
+        "origin": positioned.origin,
+        "format": settings.format or (formats.pop() if len(formats) == 1 else None)})
     with atomic_folder(out) as folder:
         measurements.save(folder / ("measurements.csv.gz" if compress else "measurements.csv"))
         write_settings(used, folder / "import.toml", out)

@@ -326,10 +326,7 @@ def merged(settings: Settings, defaults: Mapping[str, Any]) -> Settings:
 
 
 def _table_of(settings: Path, name: str, data_folder: Path | None) -> Path:
-    """Return the path of a table that a settings file names, relative to that file.
-
-    BadInput: it is outside the settings' folder, the current folder and that of the data.
-    """
+    """Return the path of a table that a settings file names; BadInput outside known folders."""
     path = settings.parent / name
     if not is_within(path, settings.parent, Path.cwd(), data_folder or Path.cwd()):
         raise BadInput(f"{settings}: {path} is neither in its folder nor in the current one, nor "

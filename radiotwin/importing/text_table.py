@@ -88,11 +88,8 @@ def find_dialect(file: LogFile, settings: Settings, expected: Sequence[Collectio
                  names: Sequence[str]) -> Dialect:
     """Detect encoding, header, delimiter, decimal mark, … of a text, where they are not declared.
 
-    Args:
-        file: of text.
-        settings: give the declared properties.
-        expected: sets of column names in lower case, one of which the header probably contains.
-        names: of the columns, if the text has no header.
+    One of the sets of column names `expected`, in lower case, is probably in the header; `names`
+    are those of a text without a header.
 
     Raises:
         BadInput: the file is no text, not in the declared encoding, or its decimal mark is
@@ -336,11 +333,8 @@ def _trailer(lines: list[str], delimiter: str, header: list[str], lengths: set[i
 def read_text_table(file: LogFile, dialect: Dialect, bad_rows: BadRows) -> Source:
     """Read the rows of a text file as a table of texts with decimal points, `""`: empty.
 
-    Args:
-        file: of text.
-        dialect: of the text.
-        bad_rows: notes rows with too many fields, and rows with too few are filled up; without a
-            limit both raise BadInput.
+    Rows with too many fields are noted in `bad_rows`, and those with too few filled up, if it has a
+    limit.
 
     Raises:
         BadInput: no header, a repeated name, or a row with too few or too many fields.

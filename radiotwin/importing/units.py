@@ -248,15 +248,9 @@ def _resolution_s(time_s: np.ndarray) -> float:
 
 
 def in_metres(numbers: np.ndarray, unit: str | None, column: str) -> np.ndarray:
-    """Convert lengths (n,) to metres.
+    """Convert lengths (n,) to metres; BadInput if the unit is unknown.
 
-    Args:
-        numbers: (n,) lengths.
-        unit: in `METRES`; None: from the end of the column's name: `alt_m`, `Height (ft)`.
-        column: for the message.
-
-    Raises:
-        BadInput: the unit is unknown.
+    It is one of `METRES`, or (None) at the end of the column's name: `alt_m`, `Height (ft)`.
     """
     if unit is None and (named := _UNIT_IN_NAME.search(column)):
         unit = "ft" if named[1].lower().startswith("f") else "m"
@@ -337,10 +331,9 @@ def _refuse_uncalibrated(source: Source, spec: str, db: np.ndarray, high_db: flo
 
 def _is_one_of(text: pd.Series, numbers: np.ndarray, values: list[float | str],
                is_text: bool) -> np.ndarray:
-    """Return which cells (n,) equal one of the values; upper and lower case are equal.
+    """Return which cells (n,) equal one of the values, in upper or lower case.
 
-    `empty` and the words for it mean an empty cell; but in a column of texts (`is_text`) the word
-    NaN is a value of its own.
+    `empty`, and but for the NaN of texts (`is_text`) the words for it, mean an empty cell.
     """
     labels = {value.strip().lower() for value in values if isinstance(value, str)}
     labels = {label if label == NOT_A_NUMBER and is_text else

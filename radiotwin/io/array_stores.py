@@ -318,10 +318,7 @@ def _codecs(folder: Path, codecs: Any) -> tuple[str | None, bool]:
 
 
 def _check_pieces(path: Path, grid: tuple[int, ...], array: _Array) -> int:
-    """Check names and sizes of an array's chunk files below a path; return their number.
-
-    Each dimension is a level of folders; `grid` is the number of chunks along those below `path`.
-    """
+    """Check the chunk files below a path, with a level of folders for each side of the grid."""
     if not grid:
         _check_piece(path, array)
         return 1

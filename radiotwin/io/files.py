@@ -141,7 +141,9 @@ def atomic_folder(path: Path | str, names: Collection[str] | None = None) -> Ite
         except (BadInput, RunFailed) as error:  # of a file in it, by the name that it will have
             raise type(error)(str(error).replace(str(temporary), str(path))) from error
         with _reported(path):
-            _flush_all([inside for inside in temporary.rglob("*") if inside.is_file()])
+            inside = [path for path in temporary.rglob("*") if path.is_file()]
+            with ThreadPoolExecutor(_FLUSHED_AT_ONCE) as pool:  # each waits for the disk
+                list(pool.map(_flush, inside))
             temporary.chmod(0o755)
             _swap(temporary, path, names)
 
@@ -467,13 +469,6 @@ def _flush(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
-
-
-def _flush_all(paths: list[Path]) -> None:
-    """Flush files in parallel, since each waits for the disk."""
-    with ThreadPoolExecutor(min(_FLUSHED_AT_ONCE, max(len(paths), 1))) as pool:
-        for _ in pool.map(_flush, paths):
-            pass
 
 
 def _refuse_folder(path: Path) -> None:

@@ -17,6 +17,7 @@ from typing import Literal, cast
 from scipy.constants import speed_of_light
 
 from radiotwin.errors import BadInput, optional_package
+from radiotwin.runtime.processes import try_program
 
 TIMEOUT_S = 120  # a first run compiles its kernels
 TOLERANCE_DB = 0.01
@@ -63,16 +64,10 @@ def trace_trial_link(device: str) -> float:
     Raises:
         TrialFailed: tracing fails, a ray went through a wall, or the gain is not Friis'.
     """
-    command = [sys.executable, "-P", "-c", _PROGRAM, device]
-    try:
-        done = subprocess.run(command, check=False, capture_output=True, text=True,
-                              timeout=TIMEOUT_S)
-    except subprocess.TimeoutExpired:
-        raise TrialFailed(f"tracing one link did not end within {TIMEOUT_S} s") from None
-    if done.returncode != 0:
-        lines = done.stderr.strip().splitlines()
-        raise TrialFailed(lines[-1] if lines else f"exit status {done.returncode}")
-    gain_db = float(done.stdout.split()[-1])
+    answer, failure = try_program(_PROGRAM, device, TIMEOUT_S)
+    if failure:
+        raise TrialFailed(failure)
+    gain_db = float(answer.split()[-1])
     if not abs(gain_db - FREE_SPACE_GAIN_DB) <= TOLERANCE_DB:  # NaN, too
         raise TrialFailed(f"the link has {gain_db:.2f} dB, free space has "
                           f"{FREE_SPACE_GAIN_DB:.2f} dB")
@@ -158,10 +153,7 @@ def torch_device(wanted: str) -> Device:
 
 
 def _device(wanted: str, work: Literal["tracing", "training"]) -> Device:
-    """Choose `cpu` or `cuda` by the option `--device`, for a kind of work, and log the reason.
-
-    `auto` takes CUDA if it works; BadInput if `cuda` is wanted and does not.
-    """
+    """Choose `cpu` or `cuda` by the option `--device`, for a kind of work, and log the reason."""
     if wanted not in DEVICES:
         raise BadInput(f"--device {wanted[:60]!r}: allowed are {', '.join(DEVICES)}"
                        + "; --devices names radios" * (work == "tracing"))

@@ -324,7 +324,9 @@ class LocalPool(Pool["_LocalWorker"]):
         Empty if fewer than two would be chosen automatically; RunFailed if a requested number does
         not fit.
         """
-        room, on_gpu = self.room(resources), _room_on_gpu(resources)
+        room, on_gpu = self.room(resources), sys.maxsize
+        if resources.gpu_share:  # of the first GPU, which CUDA gives to all processes
+            on_gpu = int(1 / resources.gpu_share + SHARE_ROUNDING)
         wanted = min(self._most or min(room, on_gpu, _cores() // resources.cores), count)
         if self._most is None and wanted < 2:
             return []
@@ -353,13 +355,6 @@ class LocalPool(Pool["_LocalWorker"]):
             return max(self._most or 0, _cores() // resources.cores)
         # Present workers free their memory when they get the next job.
         return (free + sum(each.memory_bytes for each in self._workers)) // resources.memory_bytes
-
-
-def _room_on_gpu(resources: Resources) -> int:
-    """Return how many workers fit on the first GPU, which CUDA gives to all processes."""
-    if not resources.gpu_share:
-        return sys.maxsize
-    return int(1 / resources.gpu_share + SHARE_ROUNDING)
 
 
 def _cores() -> int:

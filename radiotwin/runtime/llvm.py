@@ -20,6 +20,7 @@ from functools import cache
 from pathlib import Path
 
 from radiotwin.errors import RunFailed
+from radiotwin.runtime.processes import try_program
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 MIN_VERSION = 17  # of Dr.Jit 1.5
@@ -59,28 +60,14 @@ class Candidate:
         return f"{self.path} (version {version})"
 
 
-def _version_in_name(name: str) -> tuple[int, ...] | None:
-    """Return the version in a file name of libLLVM; None if it has none."""
-    match = _NAME.fullmatch(name)
-    digits = match and (match["before"] or match["after"])
-    return tuple(map(int, digits.split("."))) if digits else None
-
-
 @cache
 def reported_version(path: Path) -> tuple[int, ...] | str:
     """Return the version that a libLLVM reports, or the reason why it reports none, as a text.
 
     Versions below 16 cannot report it.
     """
-    try:
-        answer = subprocess.run([sys.executable, "-P", "-c", _ASK_VERSION, str(path)], check=False,
-                                capture_output=True, text=True, timeout=TIMEOUT_S)
-    except subprocess.TimeoutExpired:
-        return f"it did not load within {TIMEOUT_S} s"
-    if answer.returncode == 0:
-        return tuple(map(int, answer.stdout.split()))
-    lines = answer.stderr.strip().splitlines()
-    return lines[-1].removeprefix("OSError: ") if lines else f"exit status {answer.returncode}"
+    answer, failure = try_program(_ASK_VERSION, str(path), TIMEOUT_S)
+    return failure.removeprefix("OSError: ") or tuple(map(int, answer.split()))
 
 
 def search_folders() -> list[Path]:
@@ -123,7 +110,9 @@ def find() -> list[Candidate]:
         paths[named.resolve() if named.is_file() else named] = None
     candidates = []
     for path in paths:
-        version = _version_in_name(path.name) or reported_version(path)
+        match = _NAME.fullmatch(path.name)
+        digits = match and (match["before"] or match["after"])
+        version = tuple(map(int, digits.split("."))) if digits else reported_version(path)
         candidates.append(Candidate(path, None if isinstance(version, str) else version))
     return sorted(candidates, key=lambda candidate: candidate.version or (0,), reverse=True)
 

@@ -18,7 +18,7 @@ import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -195,19 +195,14 @@ def keep_pieces(folder: Path | None = None) -> Iterator[PieceStore]:
 
 def with_pieces(function: Callable[[P], T]) -> Callable[[P], T]:
     """Wrap a function so that it uses this process's cache in worker processes, too."""
-    return _Keeping(function, _stores[-1].folder) if _stores else function
+    return partial(_call_with_pieces, function, _stores[-1].folder) if _stores else function
 
 
-@dataclass(frozen=True)
-class _Keeping(Generic[P, T]):
-    function: Callable[[P], T]
-    folder: Path
-
-    def __call__(self, piece: P) -> T:
-        if _stores:
-            return self.function(piece)
-        with keep_pieces(self.folder):
-            return self.function(piece)
+def _call_with_pieces(function: Callable[[P], T], folder: Path, piece: P) -> T:
+    if _stores:
+        return function(piece)
+    with keep_pieces(folder):
+        return function(piece)
 
 
 def keeps() -> bool:

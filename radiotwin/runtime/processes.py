@@ -3,6 +3,7 @@
 import ctypes
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -90,6 +91,18 @@ def resident_bytes(pid: int) -> int:
         pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
         return pages * os.sysconf("SC_PAGE_SIZE")
     return 0
+
+
+def try_program(program: str, argument: str, timeout_s: float) -> tuple[str, str]:
+    """Run a Python program in another process; return its output, and why it failed, or `""`."""
+    try:
+        done = subprocess.run([sys.executable, "-P", "-c", program, argument], check=False,
+                              capture_output=True, text=True, timeout=timeout_s)
+    except subprocess.TimeoutExpired:
+        return "", f"it did not end within {timeout_s} s"
+    if done.returncode == 0:
+        return done.stdout, ""
+    return "", (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1]
 
 
 def usable_cores() -> int:

@@ -1,7 +1,5 @@
 """Summaries of objects: escaped, short, on one line."""
 
-import pytest
-
 from radiotwin.display import MAX_LINE, Summary, count, some, span
 
 HOSTILE = "<script>alert('x')</script>\x1b[31m\u202e\n"
@@ -21,8 +19,3 @@ def test_numbers_have_units():
     assert span(-101.26, -60.0, "dB") == "−101.3 to −60 dB" and span(float("nan"), 1.0, "dB") == "–"
     assert some("abc") == "a, b, c" and some(str(i) for i in range(7)) == "0, 1, 2, 3, 4, … (7 in all)"
     assert some([]) == ""
-
-
-@pytest.mark.parametrize("text", ["", "a"])
-def test_a_summary_without_facts(text):
-    assert Summary("Twin", text).html().startswith("<div><strong>Twin</strong>: ")

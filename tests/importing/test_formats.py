@@ -51,6 +51,7 @@ CHIRPSTACK = {"time": "2024-03-01T10:00:00.25+00:00", "deviceInfo": {"devEui": "
     {"gatewayId": "gw3", "rssi": -110, "snr": 0.0, "location": {"latitude": 48.3, "longitude": 11.7}}]}
 RXPK = {"rxpk": [{"tmst": 1, "time": "2024-03-01T10:00:00.25Z", "freq": 868.1, "datr": "SF7BW125", "rssi": -84, "lsnr": 9.0},
                  {"tmst": 2, "time": "2024-03-01T10:00:01.25Z", "freq": 868.1, "datr": "SF12BW125", "rssi": -119, "lsnr": -7.5}]}
+UTC, BERLIN = {"time_zone": "UTC"}, {"time_zone": "Europe/Berlin"}
 HERE = {"latitude": 48.1, "longitude": 11.5, "altitude": 520}
 
 
@@ -69,101 +70,56 @@ def imported(bring_in, text, name="data.csv", **given):
     return result, result.table, [each["format"] for each in result.report["files"]]
 
 
-def test_wigle(bring_in):
-    result, table, formats = imported(bring_in, WIGLE)
-    assert formats == ["wigle"] and list(table["device"]) == ["aa:bb", "310260_1_2"]
-    assert list(table["rssi_dbm"]) == [-61, -101] and list(table["receiver_z_m"]) == [520, 520]
-    assert table["time_s"].iloc[0] == pd.Timestamp("2024-03-01 10:00:00Z").timestamp()
-    notes = "\n".join(result.report["warnings"])
-    assert "1 line before the header" in notes and "--only Type=WIFI" in notes
+TABLES = {  # text, settings, devices, levels, first time, words in the warnings, readings left out
+    "wigle": (WIGLE, {}, ["aa:bb", "310260_1_2"], [-61, -101], "2024-03-01 10:00:00Z", "--only Type=WIFI", 0),
+    "tower-collector": (TOWER, {}, ["LTE 262-1-100-777"], [-95], "2024-03-01 10:00:00.25Z", "--only net_type=LTE", 1),
+    "cellmapper": (CELLMAPPER, {}, ["LTE 262-1-100-777", "GSM 262-1-100-9"], [-95, -70], None, "no header", 0),
+    "g-nettrack": (GNETTRACK, BERLIN, ["4G 262011007"] * 2, [-95, -96], "2024-03-01 09:00:00Z", "--only NetworkTech=4G", 0),
+    "netmonitor": (NETMONITOR, UTC, ["LTE 262-1-100-7-1"], [-95], "2024-03-01 10:00:00Z", "--only gps=1", 1),
+    "g-mon": (GMON, BERLIN, ["00:01:E3:A8:1B:A8", "00:14:A9:74:FA:40"], [-86, -68], "2014-01-12 15:39:58Z", "few rows", 1),
+    "tems": (TEMS.replace("10:00:0", "2024-03-01 10:00:0"), UTC | {"time_format": "ISO 8601"}, ["1300 12"], [-95],
+             "2024-03-01 10:00:00Z", "--time-format", 1),
+    "qualipoc": (QUALIPOC, UTC, ["1300 12"], [-95], "2024-03-01 10:00:00.5Z", "occurs more than once", 0),
+    "ttn-mapper": (TTN_MAPPER, {}, ["GW1", "GW2"], [-84, -119 - 7.5], "2024-03-01 10:00:00Z", "5.5.5", 0)}
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_tables_of_programs(bring_in, name):
+    text, given, devices, levels, start, said, left_out = TABLES[name]
+    result, table, formats = imported(bring_in, text, **given)
+    assert formats == [name] and list(table["device"]) == devices and list(table["rssi_dbm"]) == levels
+    assert table["time_s"].iloc[0] == pd.Timestamp(start).timestamp() if start else "time_s" not in table
+    assert said in "\n".join(result.report["warnings"])
+    assert sum(each["readings"] for each in result.report["left_out"]) == left_out
+
+
+def test_rows_are_chosen_by_a_column(bring_in):
     only, table, _ = imported(bring_in, WIGLE, only={"Type": ["WIFI"]})
-    assert list(table["device"]) == ["aa:bb"]
+    assert list(table["device"]) == ["aa:bb"] and list(table["receiver_z_m"]) == [520]
     assert only.report["left_out"] == [{"reason": "is not one of only", "column": "Type", "readings": 1, "first": "line 4"}]
     with pytest.raises(BadInput, match=r"column Type never is NR \(only\); it is LTE, WIFI"):
         imported(bring_in, WIGLE, only={"Type": ["NR"]})
 
 
-def test_tower_collector(bring_in):
-    result, table, formats = imported(bring_in, TOWER)
-    assert formats == ["tower-collector"] and list(table["device"]) == ["LTE 262-1-100-777"]
-    assert list(table["rssi_dbm"]) == [-95] and list(table["receiver"]) == ["Phone 1"]
-    assert table["time_s"].iloc[0] == pd.Timestamp("2024-03-01 10:00:00.25Z").timestamp()
-    assert result.report["left_out"][0]["reason"] == "not measured"
+@pytest.mark.parametrize(("text", "missing"), [(GNETTRACK, "time_zone"), (TEMS, "time_format")])
+def test_a_format_may_leave_the_clock_open(bring_in, text, missing):
+    with pytest.raises(BadInput, match=f"{missing} is not given"):
+        imported(bring_in, text)
 
 
-def test_cellmapper_has_no_header(bring_in):
-    result, table, formats = imported(bring_in, CELLMAPPER)
-    assert formats == ["cellmapper"] and list(table["device"]) == ["LTE 262-1-100-777", "GSM 262-1-100-9"]
-    assert list(table["rssi_dbm"]) == [-95, -70] and "time_s" not in table
-    assert any("no header" in note for note in result.report["warnings"])
-
-
-def test_g_nettrack(bring_in):
-    with pytest.raises(BadInput, match="time_zone is not given"):
-        imported(bring_in, GNETTRACK, "log.txt")
-    result, table, formats = imported(bring_in, GNETTRACK, "log.txt", time_zone="Europe/Berlin")
-    assert formats == ["g-nettrack"] and set(table["device"]) == {"4G 262011007"}
-    start = pd.Timestamp("2024-03-01 09:00:00Z").timestamp()
-    assert list(table["time_s"] - start) == [0, 1.5] and list(table["rssi_dbm"]) == [-95, -96]
-    assert any("--only NetworkTech=4G" in note for note in result.report["warnings"])
-
-
-def test_netmonitor(bring_in):
-    result, table, formats = imported(bring_in, NETMONITOR, time_zone="UTC")
-    assert formats == ["netmonitor"] and list(table["rssi_dbm"]) == [-95] and list(table["device"]) == ["LTE 262-1-100-7-1"]
-    assert result.report["left_out"][0]["reason"] == "not measured"
-
-
-def test_g_mon_logs_wi_fi_networks(bring_in):
-    result, table, formats = imported(bring_in, GMON, "gmon_wlan.txt", time_zone="Europe/Berlin")
-    assert formats == ["g-mon"] and list(table["rssi_dbm"]) == [-86, -68]
-    assert list(table["device"]) == ["00:01:E3:A8:1B:A8", "00:14:A9:74:FA:40"]
-    assert table["time_s"].iloc[0] == pd.Timestamp("2014-01-12 15:39:58Z").timestamp()
-    assert [each["readings"] for each in result.report["left_out"]] == [1]  # one without a position
-
-
-def test_tems(bring_in):
-    with pytest.raises(BadInput, match="time_format is not given"):
-        imported(bring_in, TEMS, "export.txt")
-    _, table, formats = imported(bring_in, TEMS.replace("10:00:0", "2024-03-01 10:00:0"), "export.txt",
-                                 time_format="ISO 8601", time_zone="UTC")
-    assert formats == ["tems"] and list(table["device"]) == ["1300 12"] and list(table["rssi_dbm"]) == [-95]
-
-
-def test_qualipoc_repeats_names(bring_in):
-    result, table, formats = imported(bring_in, QUALIPOC, time_zone="UTC")
-    assert formats == ["qualipoc"] and list(table["rssi_dbm"]) == [-95] and list(table["device"]) == ["1300 12"]
-    assert any("occurs more than once" in note for note in result.report["warnings"])
-
-
-def test_ttn_mapper_corrects_below_the_noise(bring_in):
-    result, table, formats = imported(bring_in, TTN_MAPPER)
-    assert formats == ["ttn-mapper"] and list(table["device"]) == ["GW1", "GW2"] and set(table["receiver"]) == {"node1"}
-    assert list(table["rssi_dbm"]) == [-84, -119 - 7.5] and list(result.devices["reads_levels"]) == [1, 1]
-    assert any("5.5.5" in note for note in result.report["warnings"])
-
-
-@pytest.mark.parametrize(("messages", "name"), [
-    ([STACK], "things-stack"), ([{"result": STACK}], "things-stack-storage"), ([CHIRPSTACK], "chirpstack")])
-def test_gateways_are_the_receivers_of_a_node_without_a_position(bring_in, messages, name):
-    text = "".join(json.dumps(message) + "\n" for message in messages)
-    result, table, formats = imported(bring_in, text, "uplinks.jsonl")
+@pytest.mark.parametrize(("message", "name", "payload"), [
+    (STACK, "things-stack", ["uplink_message", "decoded_payload"]),
+    ({"result": STACK}, "things-stack-storage", ["result", "uplink_message", "decoded_payload"]), (CHIRPSTACK, "chirpstack", ["object"])])
+def test_gateways_are_the_receivers_of_a_node_but_of_one_with_a_position_the_devices(bring_in, message, name, payload):
+    result, table, formats = imported(bring_in, json.dumps(message) + "\n", "uplinks.jsonl")
     assert formats == [name] and list(table["receiver"]) == ["gw1", "gw2", "gw3"] and set(table["device"]) == {"node1"}
-    assert list(table["rssi_dbm"]) == [-84, -126.5, -110]
+    assert list(table["rssi_dbm"]) == [-84, -126.5, -110] and list(result.devices["role"]) == ["unknown"]
     np.testing.assert_array_equal(table["receiver_z_m"], [560, 570, np.nan])
     assert table["time_s"].iloc[0] == pd.Timestamp("2024-03-01 10:00:00.25Z").timestamp()
-    assert list(result.devices["role"]) == ["unknown"]
-
-
-@pytest.mark.parametrize(("message", "name"), [
-    (with_position(STACK, "uplink_message", "decoded_payload"), "things-stack-mapper"),
-    ({"result": with_position(STACK, "uplink_message", "decoded_payload")}, "things-stack-storage-mapper"),
-    (with_position(CHIRPSTACK, "object"), "chirpstack-mapper")])
-def test_gateways_are_the_devices_of_a_node_with_a_position(bring_in, message, name):
-    result, table, formats = imported(bring_in, json.dumps(message) + "\n", "uplinks.json")
-    assert formats == [name] and list(table["device"]) == ["gw1", "gw2", "gw3"] and set(table["receiver"]) == {"node1"}
-    assert list(table["rssi_dbm"]) == [-84, -126.5, -110] and set(table["receiver_z_m"]) == {520}
-    assert list(result.devices["role"]) == ["anchor"] * 3 and list(result.devices["z_m"][:2]) == [560, 570]
+    result, table, formats = imported(bring_in, json.dumps(with_position(message, *payload)) + "\n", "uplinks.json")
+    assert formats == [f"{name}-mapper"] and list(table["device"]) == ["gw1", "gw2", "gw3"]
+    assert set(table["receiver"]) == {"node1"} and set(table["receiver_z_m"]) == {520} and list(result.devices["reads_levels"]) == [1] * 3
+    assert list(table["rssi_dbm"]) == [-84, -126.5, -110] and list(result.devices["z_m"][:2]) == [560, 570]
 
 
 def test_packet_forwarder_needs_a_name_and_a_place(bring_in, tmp_path):
@@ -176,6 +132,9 @@ def test_packet_forwarder_needs_a_name_and_a_place(bring_in, tmp_path):
     assert formats == ["semtech-udp"] and list(table["rssi_dbm"]) == [-84, -126.5]
 
 
+SWEPT = UTC | {"columns": {"x": "always 1", "y": "always 2"}, "length_unit": "m"}
+
+
 def test_rtl_power_integrates_a_band(bring_in):
     """Two tunings a sweep; bins of 100 kHz at 1 to 2 MHz; the last bin of each line is written twice."""
     lines = []
@@ -185,24 +144,22 @@ def test_rtl_power_integrates_a_band(bring_in):
             lines.append(f"2024-03-01, 10:00:{second:02d}, {low}, {low + 500_000}, 100000.00, 7, "
                          + ", ".join(f"{value:.4f}" for value in [*values, values[-1]]))
     text = "\n".join(lines) + "\n"
-    given = {"time_zone": "UTC", "columns": {"x": "always 1", "y": "always 2"}, "length_unit": "m"}
-    _, table, formats = imported(bring_in, text, **given)
+    _, table, formats = imported(bring_in, text, **SWEPT)
     assert formats == ["rtl-power"] and list(table["device"]) == ["1-2 MHz"] * 2
     np.testing.assert_allclose(table["rssi_dbm"], np.array([-30, -40]) + 10 * np.log10(30), atol=2e-4)
     assert np.diff(table["time_s"]) == 10
-    _, table, _ = imported(bring_in, text, band_hz=[1.3e6, 1.7e6], level_offset_db=-5.0, **given)
+    _, table, _ = imported(bring_in, text, band_hz=[1.3e6, 1.7e6], level_offset_db=-5.0, **SWEPT)
     np.testing.assert_allclose(table["rssi_dbm"], np.array([-35, -45]) + 10 * np.log10(4 + 5 + 1 + 2), atol=2e-4)
     with pytest.raises(BadInput, match="no bin lies in the band 5-6 MHz .band_hz.; the file has 1 to 2 MHz"):
-        imported(bring_in, text, band_hz=[5e6, 6e6], **given)
+        imported(bring_in, text, band_hz=[5e6, 6e6], **SWEPT)
     with pytest.raises(BadInput, match="line 2 is none of rtl_power"):
-        imported(bring_in, lines[0] + "\n1,2,3\n", **given)
+        imported(bring_in, lines[0] + "\n1,2,3\n", **SWEPT)
 
 
 def test_a_sweep_that_does_not_cover_the_band_is_not_measured(bring_in):
     text = ("2024-03-01, 10:00:00, 1000000, 1200000, 100000.00, 7, -30, -30\n"
             "2024-03-01, 10:00:10, 1000000, 1100000, 100000.00, 7, -30\n")
-    given = {"time_zone": "UTC", "columns": {"x": "always 1", "y": "always 2"}, "length_unit": "m"}
-    result, table, _ = imported(bring_in, text, band_hz=[1.0e6, 1.2e6], **given)
+    result, table, _ = imported(bring_in, text, band_hz=[1.0e6, 1.2e6], **SWEPT)
     np.testing.assert_allclose(table["rssi_dbm"], [-30 + 10 * np.log10(2)], atol=1e-4)
     assert result.report["left_out"][0]["reason"] == "not measured"
 
@@ -236,13 +193,11 @@ def test_the_documented_table_is_that_of_the_code():
 def test_sweeps_of_other_programs(bring_in, head):
     """A bin of Windows without power spoils a sweep where it is in the band."""
     text = "".join(head.format(f"1{i}") + f", -30, {'-1.#J' if i == 2 else -40}, -1.#IND\n" for i in range(4))
-    given = {"time_zone": "UTC", "columns": {"x": "always 1", "y": "always 2"}, "length_unit": "m", "format": "rtl-power"}
-    assert len(imported(bring_in, text, band_hz=[868.1e6, 868.2e6], **given)[1]) == 3
-    assert list(imported(bring_in, text, band_hz=[868.0e6, 868.1e6], **given)[1]["rssi_dbm"]) == [-30] * 4
+    assert len(imported(bring_in, text, band_hz=[868.1e6, 868.2e6], format="rtl-power", **SWEPT)[1]) == 3
+    assert list(imported(bring_in, text, band_hz=[868.0e6, 868.1e6], **SWEPT)[1]["rssi_dbm"]) == [-30] * 4
 
 
 def test_a_band_within_a_bin_has_its_power_and_its_name(bring_in):
     text = "".join(f"2024-03-01, 10:00:1{i}, 860000000, 870000000, 5000000.00, 8192, -50, -30\n" for i in range(2))
-    given = {"time_zone": "UTC", "columns": {"x": "always 1", "y": "always 2"}, "length_unit": "m"}
-    _, table, _ = imported(bring_in, text, band_hz=[868.0e6, 868.2e6], **given)
+    _, table, _ = imported(bring_in, text, band_hz=[868.0e6, 868.2e6], **SWEPT)
     assert list(table["rssi_dbm"]) == [-30, -30] and set(table["device"]) == {"865-870 MHz"}

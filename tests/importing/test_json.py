@@ -1,6 +1,7 @@
 """Shapes of JSON: records, lists of receptions, documents of pandas and of GIS, and what is in none of them."""
 
 import json
+import tracemalloc
 
 import pytest
 
@@ -12,6 +13,17 @@ RECORDS = [{"lat": 48.1 + i / 1000, "lon": 11.5, "rssi": -80 - i, "cell": "A"} f
 
 def lines(records):
     return "\n".join(map(json.dumps, records)) + "\n"
+
+
+AT_POINTS = COLUMNS | {"latitude": "latitude", "longitude": "longitude"}
+
+
+def features(*geometries):
+    """A map with a feature for each geometry; a number is a point so many degrees east of 11."""
+    made = [{"type": "Feature", "properties": {"cell": "A", "rssi": -80 - i}, "geometry":
+             each if isinstance(each, dict) else {"type": "Point", "coordinates": [11 + each, 48.1]}}
+            for i, each in enumerate(geometries)]
+    return {"type": "FeatureCollection", "features": made}
 
 
 @pytest.mark.parametrize("content", [
@@ -77,32 +89,55 @@ def test_a_node_that_moves_is_the_receiver_wherever_its_position_is(bring_in, pa
 
 def test_geojson_of_another_system(bring_in):
     """In UTM zone 32 the meridian of 9 degrees is at 500 km east, and its points are east of each other by metres."""
-    features = [{"type": "Feature", "properties": {"cell": "A", "rssi": -80 - i},
-                 "geometry": {"type": "Point", "coordinates": [500_000 + 100 * i, 5_330_000]}} for i in (-1, 1)]
-    points = {"type": "FeatureCollection", "features": features}
-    columns = COLUMNS | {"latitude": "latitude", "longitude": "longitude"}
-    named = {**points, "crs": {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::25832"}}}
+    points = features(*({"type": "Point", "coordinates": [500_000 + 100 * i, 5_330_000, 30.0]} for i in (-1, 1)))
+    named = points | {"crs": {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::25832"}}}
     for content, given in ((named, {}), (points, {"crs": "EPSG:25832"})):
-        result = bring_in(json.dumps(content), "log.geojson", columns=columns, **given)
+        result = bring_in(json.dumps(content), "log.geojson", columns=AT_POINTS | {"altitude": "altitude"}, length_unit="m", **given)
         assert result.report["origin"]["longitude_deg"] == pytest.approx(9, abs=1e-6)
         assert list(result.table["receiver_x_m"]) == pytest.approx([-100, 100], abs=0.1)
+        assert list(result.table["receiver_z_m"]) == [30, 30]
 
 
 def test_features_one_a_line(bring_in):
-    features = [{"type": "Feature", "properties": {"cell": "A", "rssi": -80 - i},
-                 "geometry": {"type": "Point", "coordinates": [11.5, 48.1]}} for i in range(3)]
-    columns = COLUMNS | {"latitude": "latitude", "longitude": "longitude"}
     for name, mark in (("log.geojsonl", ""), ("log.json", "\x1e")):
-        content = "".join(f"{mark}{json.dumps(each)}\n" for each in features)
-        assert list(bring_in(content, name, columns=columns).table["rssi_dbm"]) == [-80, -81, -82]
+        content = "".join(f"{mark}{json.dumps(each)}\n" for each in features(0, 0, 0)["features"])
+        assert list(bring_in(content, name, columns=AT_POINTS).table["rssi_dbm"]) == [-80, -81, -82]
 
 
-def test_lines_that_are_no_json_can_be_skipped(bring_in):
-    content = lines(RECORDS[:2]) + '{"lat": }\n' + lines(RECORDS[2:])
-    with pytest.raises(BadInput, match="line 3 is not readable JSON.*--skip-bad-rows 1"):
-        bring_in(content, "log.jsonl", columns=COLUMNS)
-    report = bring_in(content, "log.jsonl", columns=COLUMNS, skip_bad_rows=1).report
-    assert report["kept"] == 4 and report["bad_rows"][0]["row"] == "line 3"
+@pytest.mark.parametrize(("content", "name", "message", "row"), [
+    (lines(RECORDS[:2]) + '{"lat": }\n' + lines(RECORDS[2:]), "log.jsonl", "line 3 is not readable JSON", "line 3"),
+    (lines(RECORDS) + "[1]\n", "log.jsonl", "line 5 is no JSON object", "line 5"),
+    (json.dumps([*RECORDS, 7]), "log.json", "record 5 is '7'; allowed are objects", "record 5"),
+    (json.dumps(features(0, {"type": "LineString", "coordinates": [[0, 0], [1, 1]]}, 0.1, 0.2, 0.3)), "log.geojson",
+     "feature 2 is LineString", "feature 2")])
+def test_records_that_are_none_can_be_skipped(bring_in, content, name, message, row):
+    columns = AT_POINTS if "geo" in name else COLUMNS
+    with pytest.raises(BadInput, match=f"{message}.*--skip-bad-rows 1"):
+        bring_in(content, name, columns=columns)
+    report = bring_in(content, name, columns=columns, skip_bad_rows=1).report
+    assert report["kept"] == 4 and report["bad_rows"][0]["row"] == row
+
+
+@pytest.mark.parametrize(("content", "message"), [
+    (b'{"a": "\xff"}\n{}\n', "is not text in UTF-8"), ('{"a": ' + "[" * 100_000 + "\n", "levels of nesting"),
+    (json.dumps(features(0) | {"crs": {"properties": {"name": "EPSG:1"}}}), "its crs 'EPSG:1' cannot be read.*--crs"),
+    (json.dumps(features()), "has no rows"), ('{"type": "FeatureCollection"}', "FeatureCollection without features"),
+    (json.dumps(features({"type": "Point", "coordinates": [11.5]})), "feature 1"),
+    (json.dumps(features({})), "feature 1 is without a geometry")])
+def test_documents_that_cannot_be_read(bring_in, content, message):
+    with pytest.raises(BadInput, match=message):
+        bring_in(content, "log.json", columns=AT_POINTS)
+
+
+def test_a_line_of_many_receptions_is_refused_before_it_fills_the_memory(bring_in, monkeypatch):
+    """A node's message is repeated for each gateway that heard it."""
+    fields = ",".join(f'"key{number}":1' for number in range(1000))
+    monkeypatch.setenv("RADIOTWIN_MAX_CELLS", "100_000")
+    tracemalloc.start()
+    with pytest.raises(BadInput, match="at most 100,000"):
+        bring_in('{"rxpk":[' + ",".join(["{}"] * 2000) + "]," + fields + "}", "log.jsonl")
+    assert tracemalloc.get_traced_memory()[1] < 40e6
+    tracemalloc.stop()
 
 
 def test_lines_of_an_mqtt_client(bring_in):
@@ -110,18 +145,6 @@ def test_lines_of_an_mqtt_client(bring_in):
     for name in ("log.txt", "log.jsonl", "log.log"):
         result = bring_in(content, name, columns=COLUMNS | {"receiver": "before"})
         assert list(result.table["rssi_dbm"]) == [-80, -81, -82, -83] and result.table["receiver"][1] == "2024-05-01T10:00:01Z gateway/1"
-
-
-def test_features_that_are_no_points_can_be_skipped(bring_in):
-    features = [{"type": "Feature", "properties": {"cell": "A", "rssi": -80 - i},
-                 "geometry": {"type": "Point", "coordinates": [11.5, 48.1]}} for i in range(3)]
-    features.insert(1, {"type": "Feature", "properties": {}, "geometry": {"type": "LineString", "coordinates": [[0, 0], [1, 1]]}})
-    content = json.dumps({"type": "FeatureCollection", "features": features})
-    columns = COLUMNS | {"latitude": "latitude", "longitude": "longitude"}
-    with pytest.raises(BadInput, match="feature 2 is LineString.*--skip-bad-rows 1"):
-        bring_in(content, "log.geojson", columns=columns)
-    report = bring_in(content, "log.geojson", columns=columns, skip_bad_rows=1).report
-    assert report["kept"] == 3 and report["bad_rows"][0]["row"] == "feature 2"
 
 
 @pytest.mark.parametrize(("payload", "name", "device"), [

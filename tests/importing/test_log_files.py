@@ -36,8 +36,8 @@ def bring_all(tmp_path):
     return bring_all
 
 
-def zipped(path, files, **options):
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, **options) as archive:
+def zipped(path, files):
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in files.items():
             archive.writestr(name, content)
     return path
@@ -117,12 +117,13 @@ def test_a_declared_unit_overrules_that_of_all_formats(logs, bring_all, tmp_path
     assert "gain_db" in read_measurements(tmp_path / "out" / "measurements.csv").table
 
 
-def test_nothing_to_read(tmp_path):
+def test_folders_without_logs_or_with_too_many(logs, tmp_path, monkeypatch):
     (tmp_path / "empty").mkdir()
     with pytest.raises(BadInput, match="holds no file of a format that is read"):
         list_files([tmp_path / "empty"], [])
-    with pytest.raises(BadInput, match="holds no file"):
-        list_files([zipped(tmp_path / "a.zip", {"a.xlsx": "x"})], [])
+    monkeypatch.setenv("RADIOTWIN_MAX_IMPORT_FILES", "1")
+    with pytest.raises(BadInput, match="2 files; at most 1"):
+        list_files([logs], [])
 
 
 def test_links_out_of_the_folder_are_refused(logs, tmp_path):
@@ -139,72 +140,45 @@ def test_names_that_would_climb_are_only_names(tmp_path, bring_all):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["climb.zip", "out"]
 
 
-def test_a_bomb_is_refused_by_its_declared_size(tmp_path, monkeypatch):
-    packed = zipped(tmp_path / "bomb.zip", {f"{i}.csv": b"0" * 600_000 for i in range(4)})
-    assert packed.stat().st_size < 10_000
-    monkeypatch.setenv("RADIOTWIN_MAX_FILE_BYTES", "2_000_000")
-    with pytest.raises(BadInput, match="2,400,000 bytes; at most 2,000,000 are read"):
-        list_files([packed], [])
+def at(mark, offset, number):
+    """Change a number of a zip file, after the last place of a mark."""
+    def change(data):
+        place = data.rindex(mark) + offset
+        return data[:place] + struct.pack("<I", number) + data[place + 4:]
+    return change
 
 
-def test_a_bomb_that_lies_about_its_size_is_refused(tmp_path, bring_all):
-    """Its list of files declares 100 bytes; reading ends there, and the check sum does not fit."""
-    packed = zipped(tmp_path / "bomb.zip", {"a.csv": HEAD + "1,a,0,0,-80\n" * 100_000})
-    data = bytearray(packed.read_bytes())
-    entry = data.rindex(b"PK\x01\x02")
-    data[entry + 24:entry + 28] = struct.pack("<I", 100)
-    packed.write_bytes(data)
-    with pytest.raises(BadInput):
-        bring_all(packed)
-
-
-def test_packed_in_packed_is_bounded(tmp_path, bring_all, monkeypatch):
-    packed = zipped(tmp_path / "a.zip", {"a.csv.gz": gzip.compress(b"0" * 5_000_000)})
-    monkeypatch.setenv("RADIOTWIN_MAX_FILE_BYTES", "1_000_000")
-    with pytest.raises(BadInput, match="more than 1,000,000 bytes when decompressed"):
-        bring_all(packed)
-
-
-def test_too_many_files(logs, tmp_path, monkeypatch):
-    packed = zipped(tmp_path / "many.zip", {f"{i}.csv": "" for i in range(30)})
-    monkeypatch.setenv("RADIOTWIN_MAX_IMPORT_FILES", "20")
-    with pytest.raises(BadInput, match="30 files; at most 20"):
-        list_files([packed], [])
-    monkeypatch.setenv("RADIOTWIN_MAX_IMPORT_FILES", "1")
-    with pytest.raises(BadInput, match="2 files; at most 1"):
-        list_files([logs], [])
-
-
-def test_a_long_list_of_files_is_refused_before_it_is_read(tmp_path):
-    packed = zipped(tmp_path / "a.zip", {"a.csv": ONE})
-    data = bytearray(packed.read_bytes())
+def of_format_64(data):
     end = data.rindex(b"PK\x05\x06")
-    data[end + 12:end + 16] = struct.pack("<I", 2**30)
-    packed.write_bytes(data)
-    with pytest.raises(BadInput, match="a list of files of more than 4,194,304 bytes"):
-        list_files([packed], [])
-    data[end:end] = b"PK\x06\x07" + bytes(16)
-    packed.write_bytes(data)
-    with pytest.raises(BadInput, match="more than 65,535 files or 4 GiB"):
-        list_files([packed], [])
+    return data[:end] + b"PK\x06\x07" + bytes(16) + data[end:]
 
 
-@pytest.mark.parametrize(("change", "message"), [
-    (lambda data: b"no zip", "is no readable zip file"),
-    (lambda data: data[:40] + bytes([data[40] ^ 255]) + data[41:], "damaged|cannot be read|no readable"),
-    (lambda data: data.replace(b"PK\x01\x02\x14\x03\x14\x00\x00\x00", b"PK\x01\x02\x14\x03\x14\x00\x01\x00"), "is encrypted")])
-def test_zip_files_that_cannot_be_read(tmp_path, bring_all, change, message):
-    packed = zipped(tmp_path / "a.zip", {"a.csv": ONE})
-    packed.write_bytes(change(packed.read_bytes()))
+BAD = {  # files in a zip file, its change, limits, words of the message
+    "a bomb by its declared size": ({f"{i}.csv": b"0" * 600_000 for i in range(4)}, None, {"FILE_BYTES": "2_000_000"},
+                                    "2,400,000 bytes; at most 2,000,000 are read"),
+    "a bomb that declares 100 bytes": ({"a.csv": HEAD + "1,a,0,0,-80\n" * 100_000}, at(b"PK\x01\x02", 24, 100), {}, "a.zip"),
+    "packed in packed": ({"a.csv.gz": gzip.compress(b"0" * 5_000_000)}, None, {"FILE_BYTES": "1_000_000"},
+                         "more than 1,000,000 bytes when decompressed"),
+    "many files": ({f"{i}.csv": "" for i in range(30)}, None, {"IMPORT_FILES": "20"}, "30 files; at most 20"),
+    "a long list of files": ({"a.csv": ONE}, at(b"PK\x05\x06", 12, 2**30), {}, "a list of files of more than 4,194,304 bytes"),
+    "format 64": ({"a.csv": ONE}, of_format_64, {}, "more than 65,535 files or 4 GiB"),
+    "no zip file": ({"a.csv": ONE}, lambda data: b"no zip", {}, "is no readable zip file"),
+    "damaged": ({"a.csv": ONE}, lambda data: data[:40] + bytes([data[40] ^ 255]) + data[41:], {}, "damaged|cannot be read|no readable"),
+    "encrypted": ({"a.csv": ONE}, at(b"PK\x01\x02", 8, 1), {}, "is encrypted"),
+    "unusual compression": ({"a.csv": ONE}, at(b"PK\x01\x02", 10, zipfile.ZIP_LZMA), {}, "allowed are stored and deflated"),
+    "no log": ({"a.xlsx": "x"}, None, {}, "holds no file of a format that is read")}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_zip_files_that_cannot_be_read(tmp_path, bring_all, monkeypatch, name):
+    files, change, limits, message = BAD[name]
+    packed = zipped(tmp_path / "a.zip", files)
+    if change is not None:
+        packed.write_bytes(change(packed.read_bytes()))
+    for variable, limit in limits.items():
+        monkeypatch.setenv(f"RADIOTWIN_MAX_{variable}", limit)
     with pytest.raises(BadInput, match=message):
         bring_all(packed)
-
-
-def test_unusual_compression_is_refused(tmp_path):
-    with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_LZMA) as archive:
-        archive.writestr("a.csv", ONE)
-    with pytest.raises(BadInput, match="unusual compression; allowed are stored and deflated"):
-        list_files([tmp_path / "a.zip"], [])
 
 
 def test_all_that_is_wrong_is_in_one_message(logs, bring_all):

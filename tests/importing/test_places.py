@@ -16,18 +16,6 @@ def log(*times):
     return "t,device,x,y,level\n" + "".join(f"2024-03-01 {time},b,{i},0,-8{i}\n" for i, time in enumerate(times))
 
 
-def test_a_table_says_where_a_transmitter_was_and_when(bring_in, tmp_path):
-    (tmp_path / "sites.csv").write_text("device,x,y,z,since,until,frequency_hz\n"
-                                        "b,500,0,3,2024-03-01 12:00,,9e8\nb,100,0,2,2024-03-01 10:00,2024-03-01 11:00,8e8\n"
-                                        "c,1,1,1,,,\n")
-    result = bring_in(log("09:00", "10:00", "10:59", "11:30", "12:00", "18:00"), devices=str(tmp_path / "sites.csv"), **GIVEN)
-    assert list(result.table["device"]) == ["b", "b@1", "b@1", "b", "b@2", "b@2"]
-    devices = result.devices.set_index("device")
-    assert devices.loc["b@1", ["x_m", "z_m", "frequency_hz"]].tolist() == [100, 2, 8e8]
-    assert devices.loc["b@2", ["x_m", "z_m", "frequency_hz"]].tolist() == [500, 3, 9e8]
-    assert devices["role"].to_dict() == {"b": "unknown", "b@1": "anchor", "b@2": "anchor"}
-
-
 @pytest.mark.parametrize(("table", "message"), [
     ("device,x,y,since,until\nb,1,2,2024-03-01 12:00,2024-03-01 11:00\n", "is not before the time until which"),
     ("device,x,y,since\nb,1,2,noon\n", "'noon' is no time in the form ISO 8601"),
@@ -43,18 +31,6 @@ def test_places_over_time_need_times(bring_in, tmp_path):
     columns = {name: spec for name, spec in COLUMNS.items() if name != "time"}
     with pytest.raises(BadInput, match="'b' is at several places over time, and some of its readings have no time"):
         bring_in(log("10:00"), devices=str(tmp_path / "sites.csv"), columns=columns, length_unit="m", time_zone="UTC")
-
-
-def test_positions_of_the_log_make_places(bring_in):
-    """A beacon with its own GNSS: noise within a place, two places, and back to the first."""
-    places = [(100, 0.0), (100, 1.5), (900, 0.0), (900, 1.0), (100, 0.5), ("", "")]
-    text = "device,x,y,level,dx,dy\n" + "".join(f"b,{i},0,-8{i},{x},{y}\n" for i, (x, y) in enumerate(places))
-    columns = {"level": "level", "device": "device", "x": "x", "y": "y", "device_x": "dx", "device_y": "dy"}
-    result = bring_in(text, columns=columns, length_unit="m", place_m=5.0)
-    assert list(result.table["device"]) == ["b@1", "b@1", "b@2", "b@2", "b@1", "b"]
-    assert result.devices.set_index("device").loc["b@2", ["x_m", "y_m", "role"]].tolist() == [900, 0.5, "anchor"]
-    with pytest.raises(BadInput, match="positions 800 m apart.*--place-m 5 makes one of each place"):
-        bring_in(text, columns=columns, length_unit="m")
 
 
 def test_what_moves_all_the_time_has_no_places(bring_in):
@@ -82,12 +58,6 @@ def test_stays_are_of_one_device_and_flight():
     links = pd.concat([links_of([0, 0], [-80, -81]), links_of([0, 0], [-80, -81], device="e"),
                        links_of([0, 0], [-80, -81], flight="g")])
     assert stay_representatives(links, 5.0).sum() == 3
-
-
-def test_thinning_is_counted(bring_in):
-    result = bring_in(log("10:00:00", "10:00:01", "10:00:02"), thin_m=1.5, **GIVEN)
-    assert result.report["left_out"] == [{"reason": "stay within 1.5 m", "column": "", "readings": 1, "first": "row 2"}]
-    assert list(result.table["rssi_dbm"]) == [-81, -82]
 
 
 def test_a_clock_that_begins_anew_is_told():

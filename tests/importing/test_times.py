@@ -1,6 +1,6 @@
 """Clock readings in every form, and the two nights a year on which they mean nothing or two things."""
 
-from datetime import UTC, datetime, timedelta, timezone
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -49,11 +49,6 @@ def test_the_offset_changes_within_a_file(texts):
 def test_a_date_ends_in_no_offset():
     midnight = datetime(2024, 3, 31, tzinfo=UTC).timestamp()
     assert list(read(["2024-03-31", "20240331T01", "2024-03-31T020000"], "ISO 8601", "UTC") - midnight) == [0, 3600, 7200]
-
-
-def test_winter_has_another_offset():
-    assert read(["2022-01-06 05:00:00"], "ISO 8601", "America/Denver")[0] == \
-        datetime(2022, 1, 6, 5, tzinfo=timezone(timedelta(hours=-7))).timestamp()
 
 
 def test_the_day_is_that_of_the_zone():

@@ -115,17 +115,6 @@ def test_own_positions_come_first(bring_in, track):
     np.testing.assert_allclose(result.table["receiver_y_m"] / 111_200, [0.1, 0], atol=1e-4)
 
 
-@pytest.mark.parametrize(("content", "message"), [
-    (gpx(POINTS[:1]), "has 1 positions with a time; at least two"), ("<gpx", "malformed XML"),
-    (gpx(POINTS).replace("48.1", "north"), "line 1: lat = 'north' is not a number"),
-    (gpx(POINTS).replace("2024-03-01T10:00:01Z", "ten"), "line 2: time 'ten' is not ISO 8601"),
-    (gpx(POINTS).replace("48.1", "480"), "480 is no latitude"),
-    ('<!DOCTYPE a [<!ENTITY b "c">]><gpx/>', "declares the entity 'b'")])
-def test_gpx_that_cannot_be_used(track, content, message):
-    with pytest.raises(BadInput, match=message):
-        read_gpx(track("a.gpx", content))
-
-
 def test_few_places_and_heights_of_a_track_that_are_none_are_left_out():
     time_s, lat = np.arange(40.0), np.full(40, 48.1)
     lat[3], altitude = 677.7, np.full(40, 500.0)
@@ -167,13 +156,6 @@ def test_nmea_that_goes_on_another_day_with_gga_first(track, dated):
     sentences = [sentence for time, date in times for sentence in (gga(time, 48.1, 11.5, 500.0), dated(time, 48.1, date))]
     fixes = read_nmea(track("a.nmea", nmea(*sentences)))
     np.testing.assert_allclose(fixes.time_s - START, [0, 1, 90_000, 90_001])
-
-
-def test_nmea_without_a_date(track):
-    with pytest.raises(BadInput, match="has no date: it needs sentences RMC or ZDA"):
-        read_nmea(track("a.nmea", nmea(gga("100000.00", 48.1, 11.5, 500.0), gga("100001.00", 48.1, 11.5, 500.0))))
-    with pytest.raises(BadInput, match="has 0 positions"):
-        read_nmea(track("a.nmea", "nothing\n"))
 
 
 def ulog(topics):
@@ -219,18 +201,6 @@ def test_px4_flight_log(track):
     np.testing.assert_allclose(only.values["altitude"], [500, 501, 502])
 
 
-@pytest.mark.parametrize(("content", "message"), [
-    (b"no log", "is no PX4 flight log"), (ulog({"vehicle_gps_position": GPS}) + bytes(100), "byte [0-9]+ is none of a ULog"),
-    (ulog({"vehicle_gps_position": ([("float[65000]", "a"), ("double[65000]", "b")], [])}), "vehicle_gps_position has an unusual format"),
-    (ulog({"vehicle_attitude": ([("other", "a")], [])}), "vehicle_attitude has an unusual format"),
- (ulog({"vehicle_global_position": GLOBAL}), "has no GNSS position"),
-    (ulog({"vehicle_gps_position": (GPS[0], [(0, 0, 1, 1, 1)])}), "never had a date")])
-def test_px4_flight_logs_that_cannot_be_used(track, content, message):
-    pytest.importorskip("pyulog")
-    with pytest.raises(BadInput, match=message):
-        read_ulog(track("a.ulg", content))
-
-
 def test_positions_across_the_date_line_and_north():
     fixes = make_fixes("a", np.array([0.0, 2.0]), {"latitude": np.array([1.0, 1.0]), "longitude": np.array([179.9, -179.9]),
                                                    "heading_deg": np.array([350.0, 10.0])})
@@ -252,3 +222,26 @@ def test_an_offset_beyond_all_calendars_is_told(bring_in, track):
     path = track("flight.gpx", gpx(POINTS))
     with pytest.raises(BadInput, match="they have no time in common"):
         bring_in(LOG, columns=COLUMNS, time_format="epoch s", track=[{"file": str(path), "time_offset_s": 1e12}])
+
+
+@pytest.mark.parametrize(("read", "content", "message"), [
+    *((read_gpx, content, message) for content, message in (
+        (gpx(POINTS[:1]), "has 1 positions with a time; at least two"), ("<gpx", "malformed XML"),
+        (gpx(POINTS).replace("48.1", "north"), "line 1: lat = 'north' is not a number"),
+        (gpx(POINTS).replace("2024-03-01T10:00:01Z", "ten"), "line 2: time 'ten' is not ISO 8601"),
+        (gpx(POINTS).replace("48.1", "480"), "480 is no latitude"),
+        ('<!DOCTYPE a [<!ENTITY b "c">]><gpx/>', "declares the entity 'b'"))),
+    (read_nmea, nmea(gga("100000.00", 48.1, 11.5, 500.0)), "has no date: it needs sentences RMC or ZDA"),
+    (read_nmea, "nothing\n", "has 0 positions"),
+    *((read_ulog, content, message) for content, message in (
+        (b"no log", "is no PX4 flight log"), (ulog({"vehicle_gps_position": GPS}) + bytes(100), "byte [0-9]+ is none of a ULog"),
+        (ulog({"vehicle_gps_position": ([("float[65000]", "a"), ("double[65000]", "b")], [])}),
+         "vehicle_gps_position has an unusual format"),
+        (ulog({"vehicle_attitude": ([("other", "a")], [])}), "vehicle_attitude has an unusual format"),
+        (ulog({"vehicle_global_position": GLOBAL}), "has no GNSS position"),
+        (ulog({"vehicle_gps_position": (GPS[0], [(0, 0, 1, 1, 1)])}), "never had a date")))])
+def test_tracks_that_cannot_be_used(track, read, content, message):
+    if read is read_ulog:
+        pytest.importorskip("pyulog")
+    with pytest.raises(BadInput, match=message):
+        read(track("a.track", content))

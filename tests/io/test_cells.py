@@ -15,8 +15,6 @@ from radiotwin.errors import BadInput
 from radiotwin.io.cells import (
     CsvLayout,
     as_numbers,
-    cell_text,
-    listed,
     read_cells,
     read_table,
     write_csv,
@@ -244,11 +242,6 @@ def test_numbers_of_thousands_of_digits():
     assert not np.isfinite(numbers[[2, 6]]).any()
 
 
-def test_long_cells_and_many_columns_are_cut_in_messages():
-    assert cell_text("a'b") == repr("a'b") and len(cell_text("x" * 10**6)) < 100 and "\x1b" not in cell_text("\x1b[2J")
-    assert listed("ab") == "a, b" and listed(map(str, range(1000))).endswith("49, … (1,000 columns)")
-
-
 def layout(data: bytes) -> CsvLayout:
     layout = CsvLayout(Path("t.csv"))
     layout.check(BytesIO(data))
@@ -271,13 +264,7 @@ def test_rows_are_counted_the_same_over_blocks_and_with_quotation_marks(monkeypa
 def test_one_endless_line_is_refused_before_it_is_memory(monkeypatch, data):
     monkeypatch.setenv("RADIOTWIN_MAX_ROW_BYTES", str(2 * MIB))
     file = BytesIO(data)
-    tracemalloc.start()
-    try:
-        with pytest.raises(BadInput, match="RADIOTWIN_MAX_ROW_BYTES"):
-            CsvLayout(Path("t.csv")).check(file)
-        assert tracemalloc.get_traced_memory()[1] < 16 * MIB
-    finally:
-        tracemalloc.stop()
+    assert peak_mib(lambda: CsvLayout(Path("t.csv")).check(file)) < 16
 
 
 KINDS = {"flight": "text", "time_s": "number", "x_m": "number or nothing", "los": "0 or 1"}

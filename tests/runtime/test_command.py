@@ -43,6 +43,10 @@ def signalled(number):
     return work
 
 
+app = typer.Typer()
+app.command()(signalled(signal.SIGINT))
+
+
 @pytest.mark.parametrize("work, status, message", [
     (lambda: None, 0, ""), (failing(BadInput("--x 3: allowed is 1")), 2, "--x 3: allowed is 1"),
     (failing(RunFailed("no memory")), 1, "no memory"),
@@ -51,6 +55,8 @@ def signalled(number):
     (signalled(signal.SIGHUP), 129, "terminated; all is kept"),
     (failing(MemoryError("Unable to allocate 8 TiB")), 1,
      "out of memory while running radiotwin fit links.csv: Unable to allocate 8 TiB; use"),
+    (lambda: app([]), 130, "interrupted; all is kept"),
+    (lambda: Path("x" * 300).is_dir(), 2, "cannot be a path (File name too long)"),
     (failing(SystemExit(3)), 3, ""), (failing(BrokenPipeError()), 1, "unexpected error")])
 def test_an_error_is_one_message_and_a_status(work, status, message, capsys):
     assert exit_status(work, "all is kept") == status
@@ -65,18 +71,6 @@ def test_under_nohup_a_hang_up_stops_nothing():
 
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     assert exit_status(work, "all is kept") == 0
-
-
-def test_an_app_is_interrupted_with_a_message(capsys):
-    app = typer.Typer()
-    app.command()(signalled(signal.SIGINT))
-    assert exit_status(lambda: app([]), "go on") == 130
-    assert "interrupted; go on" in capsys.readouterr().err
-
-
-def test_a_path_that_no_file_can_have_is_bad_input(capsys):
-    assert exit_status(lambda: Path("x" * 300).is_dir(), "all is kept") == 2
-    assert "cannot be a path (File name too long)" in capsys.readouterr().err
 
 
 def overflow():

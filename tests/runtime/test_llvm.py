@@ -39,27 +39,12 @@ def write(folder, *names):
         (folder / name).write_text("not a library")
 
 
-@pytest.mark.parametrize(
-    ("name", "version"),
-    [
-        ("libLLVM-14.so.1", (14,)),
-        ("libLLVM-14.0.6.so.1", (14, 0, 6)),
-        ("libLLVM.so.19.1", (19, 1)),
-        ("libLLVM-19.so", (19,)),
-        ("libLLVM.20.1.dylib", (20, 1)),
-        ("libLLVM.dylib", None),
-        ("LLVM-C.dll", None),
-    ],
-)
+@pytest.mark.parametrize(("name", "version"), [
+    ("libLLVM-14.so.1", (14,)), ("libLLVM-14.0.6.so.1", (14, 0, 6)), ("libLLVM.so.19.1", (19, 1)), ("libLLVM-19.so", (19,)),
+    ("libLLVM.20.1.dylib", (20, 1)), ("libLLVM.dylib", None), ("LLVM-C.dll", None)])
 def test_version_from_name(tree, name, version):
-    write(tree, name)
+    write(tree, name, "libLLVMCore.so", "libLLVM-17-rust-1.77.0-stable.so", "libLLVM.so.txt")
     assert llvm.find() == [llvm.Candidate(tree / name, version)]
-
-
-@pytest.mark.parametrize("name", ["libLLVMCore.so", "libLLVM-17-rust-1.77.0-stable.so", "libLLVM.so.txt"])
-def test_other_files_are_left_out(tree, name):
-    write(tree, name)
-    assert llvm.find() == []
 
 
 def test_newest_first_and_each_library_once(tree):
@@ -78,9 +63,7 @@ def test_newest_that_works_is_chosen(tree, loaded):
 
 def test_old_ones_are_never_tried(tree, loaded):
     write(tree, "libLLVM-14.so.1", "libLLVM-15.so.1", "libLLVM-16.so.1")
-    assert llvm.choose() is None
-    assert not llvm.available()
-    assert loaded == []
+    assert not llvm.available() and loaded == []
 
 
 def test_users_own_is_the_only_choice(tree, loaded, monkeypatch, tmp_path):
@@ -95,15 +78,8 @@ def test_users_own_is_the_only_choice(tree, loaded, monkeypatch, tmp_path):
     assert "libLLVM-20.so" not in llvm.advice()
 
 
-def test_unusable_file_is_refused(tree):
-    write(tree, "libLLVM-18.so")
-    (candidate,) = llvm.find()
-    assert str(tree) in llvm.rejection(candidate)  # the loader's own complaint names the file
-    assert llvm.choose() is None
-
-
 @pytest.mark.parametrize("program, said", [
-    ("import os; os.abort()", "exit status -6"), ("import time; time.sleep(60)", "it did not load within 0.2 s")])
+    ("import os; os.abort()", "exit status -6"), ("import time; time.sleep(60)", "it did not end within 0.2 s")])
 def test_library_that_aborts_or_hangs_ends_only_its_own_process(tree, monkeypatch, program, said):
     monkeypatch.setattr(llvm, "_ASK_VERSION", program)
     monkeypatch.setattr(llvm, "TIMEOUT_S", 0.2 if "sleep" in program else 60)
@@ -131,31 +107,22 @@ def test_prepare_names_the_chosen_one_and_repeats(tree, loaded, monkeypatch):
         assert os.environ[llvm.VARIABLE] == str(tree / "libLLVM-19.so")
 
 
-@pytest.mark.parametrize(
-    ("system", "conda", "managers", "line"),
-    [
-        ("Linux", False, ["apt-get"], "apt-get install -y libllvm19  # not known there? see https://apt.llvm.org"),
-        ("Linux", False, ["dnf"], "dnf install -y llvm-libs"),
-        ("Linux", False, [], "this system's package manager has it as libLLVM, llvm or llvm-libs"),
-        ("Linux", True, ["apt-get"], "conda install -y -c conda-forge libllvm19"),
-        ("Darwin", False, [], "brew install llvm"),
-        ("Windows", False, [], "winget install LLVM.LLVM"),
-        ("Windows", True, [], "conda install -y -c conda-forge libllvm-c19"),
-    ],
-)
-def test_install_line(monkeypatch, system, conda, managers, line):
+@pytest.mark.parametrize(("system", "conda", "manager", "line"), [
+    ("Linux", False, "apt-get", "apt-get install -y libllvm19  # not known there? see https://apt.llvm.org"),
+    ("Linux", False, "dnf", "dnf install -y llvm-libs"),
+    ("Linux", False, "", "this system's package manager has it as libLLVM, llvm or llvm-libs"),
+    ("Linux", True, "apt-get", "conda install -y -c conda-forge libllvm19"), ("Darwin", False, "", "brew install llvm"),
+    ("Windows", False, "", "winget install LLVM.LLVM"), ("Windows", True, "", "conda install -y -c conda-forge libllvm-c19")])
+def test_install_line(monkeypatch, system, conda, manager, line):
     monkeypatch.setattr(llvm.platform, "system", lambda: system)
-    monkeypatch.setattr(llvm.shutil, "which", lambda name: name if name in managers else None)
+    monkeypatch.setattr(llvm.shutil, "which", lambda name: name if name == manager else None)
     monkeypatch.setattr(llvm.os, "geteuid", lambda: 0, raising=False)
     monkeypatch.setenv("CONDA_PREFIX", "/conda" if conda else "")
     assert llvm.install_line() == line
 
 
 def run_python(program, **environment):
-    return subprocess.run(
-        [sys.executable, "-c", program], check=False, capture_output=True, text=True,
-        env={**os.environ, **environment}, timeout=120,
-    )
+    return subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=os.environ | environment, timeout=120)
 
 
 def test_drjit_imported_too_early_without_a_working_one():
@@ -166,11 +133,8 @@ def test_drjit_imported_too_early_without_a_working_one():
 
 @pytest.mark.llvm
 def test_chosen_one_runs_kernels_in_a_fresh_process():
-    program = (
-        "from radiotwin.runtime import llvm; llvm.prepare(); llvm.prepare()\n"
-        "import drjit; from drjit.llvm import Float\n"
-        "llvm.prepare(); print(float(drjit.sum(drjit.arange(Float, 101))[0]), drjit.detail.llvm_version()[0])"
-    )
+    program = ("from radiotwin.runtime import llvm; llvm.prepare(); llvm.prepare()\n"
+               "import drjit; from drjit.llvm import Float\n"
+               "llvm.prepare(); print(float(drjit.sum(drjit.arange(Float, 101))[0]), drjit.detail.llvm_version()[0])")
     total, major = run_python(program).stdout.split()
-    assert float(total) == 5050
-    assert int(major) >= llvm.MIN_VERSION
+    assert float(total) == 5050 and int(major) >= llvm.MIN_VERSION

@@ -51,12 +51,14 @@ def test_a_part_is_made_once_and_comes_back_to_the_bit():
     assert store.progress == "1 of 1 parts were kept from an earlier run"
 
 
-def test_other_inputs_are_another_part():
+@pytest.mark.parametrize("inputs, calls, files", [
+    ([(1,), (2,), (1, 2), ("1",)], 4, 4), ([(1,), (1,)], 1, 1), ([(object(),), (object(),)], 2, 0)])
+def test_other_inputs_are_another_part_and_unknown_ones_are_not_kept(inputs, calls, files):
     work = Work()
-    with keep_pieces():
-        for inputs in ((1,), (2,), (1, 2), ("1",)):
-            work.cached(*inputs)
-    assert work.calls == 4
+    with keep_pieces() as store:
+        for each in inputs:
+            work.cached(*each)
+    assert work.calls == calls and len(store.files()) == files and store.progress == ""
 
 
 def test_other_code_or_libraries_make_another_part(monkeypatch):
@@ -72,20 +74,6 @@ def test_nothing_is_kept_where_nobody_asks_for_it(own_cache):
     work = Work()
     work.cached(1), work.cached(1)
     assert work.calls == 2 and not own_cache.exists()
-
-
-def test_inputs_of_unknown_content_are_not_kept():
-    work = Work()
-    with keep_pieces() as store:
-        work.cached(object()), work.cached(object())
-    assert work.calls == 2 and not store.files()
-
-
-def test_a_part_of_this_run_is_not_one_of_an_earlier_run():
-    work = Work()
-    with keep_pieces() as store:
-        work.cached(1), work.cached(1)
-    assert work.calls == 1 and store.progress == ""
 
 
 def test_quick_parts_are_not_written(monkeypatch):
@@ -193,15 +181,11 @@ def test_two_threads_of_work_in_one_folder_do_not_disturb_each_other(monkeypatch
     assert not errors
 
 
-def test_versions_are_those_of_every_source():
+def test_versions_are_the_same_in_every_process():
     found = pieces.versions()
     assert any(each.startswith("numpy ") for each in found) and any(each.startswith("scipy ") for each in found)
-    assert found == subprocess_versions()
-
-
-def subprocess_versions():
     text = "from radiotwin.runtime.pieces import versions; print(*versions(), sep='\\n')"
-    return tuple(subprocess.run([sys.executable, "-c", text], capture_output=True, text=True).stdout.splitlines())
+    assert found == tuple(subprocess.run([sys.executable, "-c", text], capture_output=True, text=True).stdout.splitlines())
 
 
 def test_the_folder_is_in_the_users_cache(monkeypatch, tmp_path):

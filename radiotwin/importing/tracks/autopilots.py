@@ -26,9 +26,9 @@ from typing import Any
 import numpy as np
 
 from radiotwin.errors import BadInput, optional_package
-from radiotwin.importing.tracks.fixes import Fixes, make_fixes
+from radiotwin.importing.tracks.fixes import PLACE, Fixes, make_fixes
 from radiotwin.io.budgets import FILE_BYTES, ROWS
-from radiotwin.io.inputs import open_input
+from radiotwin.io.inputs import open_input, read_bytes
 
 _LETTERS = {"a": "64s", "b": "b", "B": "B", "h": "h", "H": "H", "i": "i", "I": "I", "f": "f",
             "d": "d", "n": "4s", "N": "16s", "Z": "64s", "c": "h", "C": "H", "e": "i", "E": "I",
@@ -52,14 +52,9 @@ _GPS = ("vehicle_gps_position", "sensor_gps")
 _TOPICS = ["vehicle_global_position", *_GPS, "vehicle_attitude"]
 
 
-def _content(path: Path) -> bytes:
-    with open_input(path, "flight log of ArduPilot", FILE_BYTES) as file:
-        return file.read()
-
-
 def read_dataflash(path: Path) -> Fixes:
     """Read positions and attitude from a DataFlash log, binary or text; BadInput without GPS."""
-    content = _content(path)
+    content = read_bytes(path, "flight log of ArduPilot")
     is_text = content[:4] == b"FMT,"
     gps: list[list[float]] = []  # since start, week, since its start, place
     attitude: list[list[float]] = []  # since start, roll, pitch, yaw
@@ -81,7 +76,7 @@ def read_dataflash(path: Path) -> Fixes:
     leap_s = np.full(len(time_s), float(_LEAPS[-1][1]))
     for since_s, number in reversed(_LEAPS):
         leap_s[time_s - number >= since_s] = number
-    values = dict(zip(("latitude", "longitude", "altitude"), columns[3:]))
+    values = dict(zip(PLACE, columns[3:]))
     values |= _nearest(np.array(attitude, dtype=float).reshape(-1, 4), columns[0])
     return make_fixes(path, time_s - leap_s, values)
 
@@ -149,7 +144,7 @@ def read_tlog(path: Path) -> Fixes:
     positions: dict[int, list[list[float]]] = {}
     attitudes: dict[int, list[list[float]]] = {}
     damaged = 0
-    for time_s, system, number, body in _packets(_content(path)):
+    for time_s, system, number, body in _packets(read_bytes(path, "telemetry log")):
         if body is None:
             damaged += 1
             continue
@@ -169,7 +164,7 @@ def read_tlog(path: Path) -> Fixes:
     notes = [f"{path.name}: {damaged} damaged messages are left out"] if damaged else []
     if len(positions) > 1:
         notes.append(f"{path.name}: of {len(positions)} vehicles number {system} is read")
-    values = dict(zip(("latitude", "longitude", "altitude"), columns[1:]))
+    values = dict(zip(PLACE, columns[1:]))
     values |= _nearest(np.array(attitudes.get(system, []), dtype=float).reshape(-1, 4), columns[0])
     return make_fixes(path, columns[0], values, tuple(notes))
 

@@ -9,7 +9,8 @@ from radiotwin.importing.source import are_few
 from radiotwin.links.plausible import MAX_DEGREES, height_placeholders
 
 ANGLES = ("heading_deg", "pitch_deg", "roll_deg")
-COLUMNS = ("latitude", "longitude", "altitude", *ANGLES)
+PLACE = ("latitude", "longitude", "altitude")
+COLUMNS = (*PLACE, *ANGLES)
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 
 from radiotwin.errors import BadInput, optional_package
-from radiotwin.importing.tracks.fixes import Fixes, make_fixes
+from radiotwin.importing.tracks.fixes import PLACE, Fixes, make_fixes
 from radiotwin.io.budgets import BAG_CHUNK_BYTES, ENTRIES, FILE_BYTES, ROW_BYTES, ROWS
 from radiotwin.io.cells import listed
 from radiotwin.io.inputs import open_input, require_within
@@ -303,8 +303,7 @@ def read_rosbag(path: Path, topic: str | None = None) -> Fixes:
             ROWS.check(len(rows) / _COLUMNS, part)
             ENTRIES.check(len(topics), part)
     columns = np.array(_rows_of_topic(path, topics, topic)).reshape(-1, _COLUMNS).T
-    return make_fixes(path, columns[0], dict(zip(("latitude", "longitude", "altitude"),
-                                                 columns[1:])),
+    return make_fixes(path, columns[0], dict(zip(PLACE, columns[1:])),
                       (f"{path.name}: altitudes are above the WGS84 ellipsoid, as NavSatFix has "
                        "them; that of --origin must be, too",))
 

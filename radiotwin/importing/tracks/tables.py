@@ -64,12 +64,7 @@ def _find(header: list[str], quantity: str, unit: str | None = None) -> str | No
 
 
 def read_track_table(path: Path, track: TrackFile, zone: str | None) -> Fixes:
-    """Read a table of positions over time.
-
-    Args:
-        path: in any format of `read_source`.
-        track: declares columns, times and lengths.
-        zone: of times without an offset from UTC, if the track declares none.
+    """Read a table of positions over time; `zone` is that of times without an own one or an offset.
 
     Raises:
         BadInput: no column of time, latitude or longitude, or cells that cannot be read.

@@ -20,7 +20,7 @@ import numpy as np
 
 from radiotwin.errors import BadInput
 from radiotwin.importing.log_files import Lines
-from radiotwin.importing.tracks.fixes import ANGLES, Fixes, make_fixes
+from radiotwin.importing.tracks.fixes import ANGLES, PLACE, Fixes, make_fixes
 from radiotwin.io.budgets import DOCUMENT_BYTES, ROWS
 from radiotwin.io.cells import cell_text
 from radiotwin.io.inputs import open_gzip, parse_elements, parse_json
@@ -28,7 +28,6 @@ from radiotwin.io.inputs import open_gzip, parse_elements, parse_json
 _DAY_S = 86_400.0
 _CENTURY = 80  # years below it are of this century
 _MAX_TEXT = 200  # characters of a time, a place or angles
-_PLACE = ("latitude", "longitude", "altitude")
 
 
 def read_nmea(path: Path) -> Fixes:
@@ -67,8 +66,7 @@ def read_nmea(path: Path) -> Fixes:
         raise BadInput(f"{path} has no date: it needs sentences RMC or ZDA beside GGA")
     time_s = _days(columns[0], columns[1]) * _DAY_S + columns[0]
     notes = (f"{path.name}: {damaged} damaged sentences are left out",) if damaged else ()
-    return make_fixes(path, time_s, dict(zip(_PLACE, columns[2:])),
-                      notes)
+    return make_fixes(path, time_s, dict(zip(PLACE, columns[2:])), notes)
 
 
 def _sentence(line: str) -> tuple[list[str], bool]:
@@ -213,7 +211,7 @@ class _Points(_Rows):
 def read_gpx(path: Path) -> Fixes:
     """Read the track points of a GPX file (times are UTC); BadInput if fewer than two have one."""
     columns = np.array(_Points(path).rows, dtype=float).reshape(-1, 4).T
-    return make_fixes(path, columns[0], dict(zip(_PLACE, columns[1:])))
+    return make_fixes(path, columns[0], dict(zip(PLACE, columns[1:])))
 
 
 class _Track(_Rows):
@@ -289,9 +287,8 @@ def read_geojson(path: Path) -> Fixes | None:
     Raises:
         BadInput: a line has another number of times than of positions.
     """
-    with open_gzip(path, "GeoJSON file") as file:
+    with open_gzip(path, "GeoJSON file", DOCUMENT_BYTES) as file:
         text = file.read()
-    DOCUMENT_BYTES.check(len(text), path)
     if b"LineString" not in text:
         return None
     data = parse_json(text.decode("utf-8-sig", "replace"), path)

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import threading
 import warnings
 
 import numpy as np
@@ -156,11 +157,13 @@ def test_pages_of_files_are_given_back(monkeypatch, tmp_path):
     assert processes._group_bytes() is None
 
 
-def test_auto_does_what_it_has_no_memory_for_in_this_process():
-    with open_executor("auto") as executor:
-        executor._patience_s = 0.0
-        found = executor.run(Job("environments", environment, Resources(memory_bytes=2**50)), range(3))
-    assert {pid for pid, _, _ in found} == {os.getpid()}
+@pytest.mark.parametrize("patience_s, memory_bytes", [(0.0, 2**50), (20.0, 0)])  # too much memory, and done at once
+def test_auto_starts_no_worker_that_would_not_help(patience_s, memory_bytes):
+    said = []
+    with open_executor("auto", say=said.append) as executor:
+        executor._patience_s = patience_s
+        found = executor.run(Job("environments", environment, Resources(memory_bytes=memory_bytes)), range(50))
+    assert {pid for pid, _, _ in found} == {os.getpid()} and not said
 
 
 @pytest.mark.skipif(usable_cores() < 2, reason="one core: there is no worker that would help")
@@ -172,13 +175,6 @@ def test_auto_starts_workers_when_the_work_goes_on_for_long():
         found = executor.run(Job("naps", nap), [0.5, *[0.3] * 20])
     assert found[:2] == [os.getpid()] * 2 and os.getpid() not in found[2:]
     assert len(said) == 1
-
-
-def test_auto_starts_no_worker_for_what_is_done_at_once():
-    said = []
-    with open_executor("auto", say=said.append) as executor:
-        assert {pid for pid, _, _ in executor.run(Job("environments", environment), range(50))} == {os.getpid()}
-    assert not said
 
 
 def test_what_will_be_used_is_said():
@@ -218,19 +214,12 @@ def test_nothing_is_left_of_a_killed_driver(tmp_path, cluster, number):
     wait_until(lambda: not processes_with(mark), 15)
 
 
-def test_a_function_that_cannot_be_sent():
-    import threading
-
-    with open_executor("2") as executor, pytest.raises(RunFailed, match="cannot be sent to another process"):
-        executor.run(Job("locked", lambda number, lock=threading.Lock(): number), range(2))
-
-
-def test_what_cannot_be_run_ahead_elsewhere_is_said_once():
-    import threading
-
-    lines = []
+def test_a_function_that_cannot_be_sent_is_refused_but_ahead_only_told_once():
+    job, lines = Job("locked", lambda number, lock=threading.Lock(): number), []
     with open_executor("2", say=lines.append) as executor:
+        with pytest.raises(RunFailed, match="cannot be sent to another process"):
+            executor.run(job, range(2))
         for _ in range(2):
-            executor.run_ahead(Job("locked", lambda number, lock=threading.Lock(): number), range(2), NoCache())
+            executor.run_ahead(job, range(2), NoCache())
     (line,) = lines
     assert line.startswith("locked") and "cannot be sent to another process" in line and "in this process" in line
