@@ -31,14 +31,7 @@ _SEPARATOR = "\x1e"  # before each record of RFC 8142
 
 
 class _Table:
-    """Collects the rows of records.
-
-    Args:
-        file: for messages.
-        used: needed columns, in lower case; if there are none, the objects of all lists are rows.
-        chosen: the only list whose objects are rows, or None.
-        crs: of the coordinates of features, if the file declares none.
-    """
+    """Collects the rows of records; for its arguments see `read_json_log`."""
 
     def __init__(self, file: LogFile, used: Collection[str], chosen: str | None,
                  crs: str | None) -> None:
@@ -119,10 +112,7 @@ class _Table:
 
     def _add_list(self, name: str, items: list[Any], flat: dict[str, str],
                   receptions: list[tuple[str, list[Any]]]) -> None:
-        """Add a list to `receptions` if of objects, to `flat` if short; else count it as unread.
-
-        Objects become rows if their list is the chosen one, or has a used column.
-        """
+        """Add a list to `receptions` if of objects, to `flat` if short; else count it as unread."""
         if items and all(isinstance(each, dict) for each in items):
             if name not in self._is_rows:
                 begin = f"{name.lower()}."

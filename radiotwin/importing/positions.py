@@ -154,8 +154,7 @@ def _names_by_place(source: Source, links: pd.DataFrame, device_m: np.ndarray,
                 place_m: float) -> np.ndarray:
     """Return the device of each link (n,); if it has several places, as `NAME@1`, ….
 
-    Positions (n, 3) [m] within `place_m` of the first one at a place belong to it; places are
-    numbered as they occur.
+    Positions (n, 3) [m] within `place_m` of the first one at a place belong to it.
     """
     names = links["device"].to_numpy(dtype=object, copy=True)
     filled_m = np.nan_to_num(device_m)
@@ -415,10 +414,9 @@ def _check_near(source: Source, links: pd.DataFrame, position_m: np.ndarray, end
 
 def _positions(links: pd.DataFrame, prefix: str, table: pd.DataFrame | None, names: pd.Series,
                crs: str | None) -> pd.DataFrame:
-    """Return positions and heights of links' ends (columns of `POSITION`), NaN: unknown.
+    """Return positions and heights of links' ends, from the log, else from `table` by their name.
 
-    Both are taken from the log (columns that begin with `prefix`), else from `table` by the end's
-    name; a position or a height is never mixed from both.
+    NaN: unknown. A position or a height is never mixed from both.
     """
     columns = {name: links[prefix + name] for name in POSITION if prefix + name in links}
     positions = to_geographic(pd.DataFrame(columns, index=links.index), crs)
@@ -441,10 +439,7 @@ def _positions(links: pd.DataFrame, prefix: str, table: pd.DataFrame | None, nam
 
 def _above_ground_m(links: pd.DataFrame, prefix: str, table: pd.DataFrame | None, names: pd.Series,
                     z_m: np.ndarray) -> np.ndarray:
-    """Return heights above the ground (n,) [m] of links' ends: from the log, else from the table.
-
-    NaN if there is none, or if the height above the datum, `z_m` (n,), is known.
-    """
+    """Return heights above the ground (n,) [m] of links' ends without a height above the datum."""
     above_m = np.full(len(names), np.nan)
     if table is not None and "above_ground_m" in table:
         above_m = names.map(table["above_ground_m"]).to_numpy(dtype=float)
@@ -457,10 +452,9 @@ def _above_ground_m(links: pd.DataFrame, prefix: str, table: pd.DataFrame | None
 def _device_table(source: Source, links: pd.DataFrame, device_m: np.ndarray,
                   table: pd.DataFrame | None, declared_as: dict[str, str],
                   moving_m: float) -> pd.DataFrame:
-    """Make the table `devices.csv` of the links' devices; BadInput if a device moves.
+    """Make the table `devices.csv`; BadInput if a device's positions span more than `moving_m` [m].
 
-    A device moves if its positions span more than `moving_m` [m]. `declared_as` maps names that
-    `_split_by_band` made to the names in the table of devices, `table`.
+    `declared_as` maps names that `_split_by_band` made to those in the table of devices, `table`.
     """
     by_device = pd.DataFrame(device_m, columns=["x_m", "y_m", "z_m"], index=links.index).groupby(
         links["device"].to_numpy(), sort=False)

@@ -142,10 +142,7 @@ def _from_file_name(source: Source, name: str, spec: str, file_name: str) -> str
 
 def _row_columns(source: Source, columns: dict[str, str], settings: Settings,
                  problems: Problems) -> pd.DataFrame:
-    """Read times, positions and names of rows, which belong to all levels in a row.
-
-    Errors are collected in `problems`, so that a message has all; the result is then incomplete.
-    """
+    """Read times, positions and names of rows, which belong to all levels in a row."""
     shared = pd.DataFrame(index=source.table.index)
     present = {name for name, spec in columns.items()
                if spec in (BY_DAY, BY_POSITION)

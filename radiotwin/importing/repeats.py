@@ -76,10 +76,7 @@ def positions_m(links: pd.DataFrame) -> np.ndarray:
 
 def _bins(links: pd.DataFrame, track: np.ndarray,
           length_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Divide tracks into bins of a length [m]; return each row's bin (n,) and each first row.
-
-    Rows are sorted by `track` (n,), a label; the length is measured along the track.
-    """
+    """Divide tracks (sorted, n labels) into bins along them; return each row's bin, first rows."""
     position_m = positions_m(links)
     step_m = np.linalg.norm(np.diff(position_m, axis=0, prepend=position_m[:1]), axis=1)
     starts = np.diff(track, prepend=-1) != 0

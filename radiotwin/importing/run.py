@@ -54,10 +54,7 @@ DECIMALS = {"_m": 3, "_db": 4, "_dbm": 4, "_deg": 4, "_s": 6}
 def _make_report(logs: Logs, notes: list[str], others: int, kept: int, tally: Tally,
                 positioned: PositionedLinks, measurements: Measurements,
                 settings: Settings) -> dict[str, Any]:
-    """Return the content of `import.json`; its readings are those kept and those left out.
-
-    `others` is the number of files of other formats, `kept` that of the links before averaging.
-    """
+    """Return the content of `import.json`; `kept` is the number of links before averaging."""
     table, devices = measurements.table, measurements.devices
     origin = positioned.origin
     time_s = table["time_s"].dropna() if "time_s" in table else pd.Series(dtype=float)

@@ -189,10 +189,7 @@ def _lines(number: int, where: str) -> str:
 
 def _scan(content: IO[bytes], file: LogFile,
           declared: str | None) -> tuple[bytes, bytes, bool, str]:
-    """Read a text once, to find its encoding.
-
-    Returned are its first and last block, whether the first is all of it, and the encoding.
-    """
+    """Read a text once; return first and last block, whether that is one, and the encoding."""
     head = tail = content.read(_BLOCK_BYTES)
     encoding = codecs.lookup(declared).name if declared else next(
         (name for bom, name in _BOMS if head.startswith(bom)), "utf-8")
@@ -315,10 +312,7 @@ def _decimal(file: LogFile, delimiter: str, rows: list[list[str]], is_typed: boo
 
 
 def _trailer(lines: list[str], delimiter: str, header: list[str], lengths: set[int]) -> int:
-    """Count the last lines that are no rows of the table, such as a summary.
-
-    A row has as many fields as the header, or one of the `lengths` of other rows.
-    """
+    """Count the last lines that are neither as long as the header nor of the rows' `lengths`."""
     columns, count = len(header_names(header)), 0
     for line in reversed(lines):
         fields = _fields(line, delimiter)

@@ -330,10 +330,7 @@ def _sweep(folder: Path) -> None:
 
 
 def _remove_stale(path: Path, aside: bool) -> None:
-    """Remove a temporary folder whose process has ended; an error is raised if it lives.
-
-    With `aside`, the older content that it holds is put back first.
-    """
+    """Remove a temporary folder whose process has ended, after its content `aside` is put back."""
     handle = os.open(path, os.O_RDONLY)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises if its process lives
@@ -362,8 +359,6 @@ def _is_one_of(name: str, patterns: Collection[str]) -> bool:
 
 def _temporaries_place(path: Path) -> Path:
     """Return a path beside which temporary folders for the folder `path` can be made.
-
-    That is `path` itself, so that they are in its parent, or a path inside it.
 
     A working folder, a link, a mount point (a container's volume), and a folder in a
     write-protected one cannot be renamed; then temporaries go inside.

@@ -133,10 +133,9 @@ class Executor:
 
     def _run_here(self, job: Job, todo: "deque[_Todo]", cache: Cache,
                   advance: Callable[..., None], patience_s: float) -> None:
-        """Run pieces in this process, until they take longer than a worker's start is worth.
+        """Run pieces in this process, and remove them from `todo`, until `patience_s` is exceeded.
 
-        They do if the time so far, or that of the rest at the same speed, exceeds `patience_s`.
-        Pieces that are done are removed from `todo`, in place.
+        It is by the time so far, or by that of the rest at the same speed.
         """
         first_s = total_s = 0.0
         done = 0

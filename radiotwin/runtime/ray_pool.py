@@ -145,10 +145,7 @@ class RayPool(Pool["_RayWorker"]):
         return self._workers
 
     def _capacity(self, resources: Resources) -> int:
-        """Return how many workers to start: as many as asked for, else as fit on the cluster.
-
-        RunFailed if the number that is asked for, or a single one, does not fit.
-        """
+        """Return how many workers to start; RunFailed if those asked for, or one, do not fit."""
         nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
         needs = {"CPU": resources.cores, "memory": resources.memory_bytes,
                  "GPU": resources.gpu_share}

@@ -5,7 +5,6 @@ import pandas as pd
 import pytest
 from scipy.integrate import quad
 
-from radiotwin.errors import BadInput
 from radiotwin.importing.positions import find_origin, to_geographic
 from radiotwin.io.forms import Origin
 from radiotwin.links.site_table import local_positions
@@ -58,27 +57,6 @@ def test_utm_gives_the_same_metres_as_degrees():
     np.testing.assert_allclose(utm["longitude"], 9.0, atol=1e-9)
     found = find_origin(Origin(latitude_deg=utm["latitude"][0], longitude_deg=9.0), utm, utm)
     np.testing.assert_allclose(local_positions(utm, found), [[0, 0, 3], [0, 1000 / 0.9996, 4]], atol=1e-4)
-
-
-def test_local_and_geographic_positions_need_an_origin():
-    receivers, devices = positions(latitude=48.0, longitude=11.0), positions(x=5.0, y=6.0, z=7.0)
-    with pytest.raises(BadInput, match="--origin"):
-        find_origin(None, receivers, devices)
-    declared = find_origin(Origin(latitude_deg=48, longitude_deg=11), receivers, devices)
-    np.testing.assert_array_equal(local_positions(devices, declared), [[5, 6, 7]])
-
-
-@pytest.mark.parametrize(("crs", "x", "y", "message"), [
-    ("EPSG:1", 0, 0, "EPSG:1.*is unknown.*such as EPSG:32633"),
-    ("EPSG:4326", 11, 48, "not a projected one"),
-    ("EPSG:32632", 11, 48, "x, y = 11, 48 is latitude 0.000, longitude 4.511, far outside"),
-    ("EPSG:32632", 5.3e6, 5e5, "far outside of the area of 'EPSG:32632'.*swapped"),
-    ("+proj=utm +zone=32 +ellps=bessel +nadgrids=/etc/passwd", 5e5, 5.3e6, "is unknown.*AUTHORITY:CODE"),
-    ("+init=/etc/passwd:1", 5e5, 5.3e6, "is unknown.*AUTHORITY:CODE"),
-])
-def test_systems_that_do_not_fit(crs, x, y, message):
-    with pytest.raises(BadInput, match=message):
-        to_geographic(pd.DataFrame({"x": [float(x)], "y": [float(y)]}), crs)
 
 
 def test_an_area_across_the_date_line():

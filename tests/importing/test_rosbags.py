@@ -12,6 +12,7 @@ from radiotwin.cli import main
 from radiotwin.errors import BadInput
 from radiotwin.importing.tracks.rosbag import read_rosbag
 from radiotwin.links.measurements import read_measurements
+from tests.command_line import run_in_this_process
 
 rosbags = pytest.importorskip("rosbags")
 START = int(pd.Timestamp("2024-03-01 10:00:00Z").timestamp())
@@ -67,23 +68,15 @@ def test_times_of_the_recording_where_headers_have_none(tmp_path):
     np.testing.assert_allclose(fixes.time_s - START, [0, 1, 3])
 
 
-def test_import_joins_a_log_with_a_bag(tmp_path, capsys, monkeypatch):
+def test_import_joins_a_log_with_a_bag(tmp_path):
     (tmp_path / "log.csv").write_text("t,id,rssi\n" + "".join(f"{START + t},b,-8{i}\n" for i, t in enumerate((0.75, 1.25, 60))))
     bag = write(tmp_path / "flight", ["/gps/fix", "/mavros/global_position/raw/fix"])
-    def run(*words):
-        monkeypatch.setattr("sys.argv", ["radiotwin", *words])
-        try:
-            main()
-        except SystemExit as end:
-            return end.code or 0
-        return 0
-
-    given = ["import", str(tmp_path / "log.csv"), "--columns", "time=t,device=id,level=rssi", "--level-unit", "dBm", "--time-format",
-             "epoch s", "--track", str(bag), "--origin", "48.15,11.5,500", "-o", str(tmp_path / "out")]
-    assert run(*given) == 2
-    assert "name one of /gps/fix, /mavros/global_position/raw/fix with --track-topic" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
-    assert run(*given, "--track-topic", "/gps/fix") == 0
+    given = ("import log.csv --columns time=t,device=id,level=rssi --level-unit dBm "
+             f"--track {bag} --origin 48.15,11.5,500 -o out").split() + ["--time-format", "epoch s"]
+    refused = run_in_this_process(main, given, tmp_path)
+    assert refused.returncode == 2 and not (tmp_path / "out").exists()
+    assert "name one of /gps/fix, /mavros/global_position/raw/fix with --track-topic" in " ".join(refused.stderr.split())
+    assert run_in_this_process(main, [*given, "--track-topic", "/gps/fix"], tmp_path).returncode == 0
     table = read_measurements(tmp_path / "out" / "measurements.csv").table
     np.testing.assert_allclose(table["receiver_z_m"], [65, 70])
     assert abs(table["receiver_y_m"][0]) < 0.1 and 'topic = "/gps/fix"' in (tmp_path / "out" / "import.toml").read_text()

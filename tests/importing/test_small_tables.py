@@ -227,7 +227,7 @@ CASES = {
         "x,l,d\n" + "".join(f"{i + 300_000 * (i > 20)},{-80 - i % 9},a\n" for i in range(40)), local(y="always 0"), left_out={},
         says="300 km apart"),
     "a far gateway is no glitch": Case(
-        "x,l,d,g\n" + "".join(f"{150_000 * (i == 7)},{-80 - i % 9},a,{'far' if i == 7 else 'near'}\n" for i in range(40)),
+        "x,l,d,g\n" + "".join(f"{150_000 if i == 7 else i},{-80 - i % 9},a,{'far' if i == 7 else 'near'}\n" for i in range(40)),
         local(y="always 0", receiver="g"), left_out={}),
     "a place that a program writes without a fix": Case(
         "d,lat,lon,r,l,n\n" + "".join(f"{row},{i}\n" for i, row in enumerate(
@@ -311,6 +311,11 @@ REFUSED = [  # text, settings, words of the message
     ("x,y,d,l,dx,dy\n0,0,b,-80,100,0\n1,0,b,-81,900,0\n", local(device_x="dx", device_y="dy"),
      "positions 800 m apart.*--place-m 5 makes one of each place"),
     (ONE, local(_devices="nowhere.csv"), "nowhere.csv does not exist"),
+    ("x,y,d,l,la,lo\n0,0,a,-80,48,11\n", local(device_latitude="la", device_longitude="lo"), "some positions are latitude.*--origin"),
+    (ONE, local(_crs="EPSG:1"), "EPSG:1.*is unknown.*such as EPSG:32633"), (ONE, local(_crs="EPSG:4326"), "not a projected one"),
+    (ONE, local(_crs="+init=/etc/passwd:1"), "is unknown.*AUTHORITY:CODE"),
+    (lines("11,48"), local(_crs="EPSG:32632"), "x, y = 11, 48 is latitude 0.000, longitude 4.511, far outside"),
+    (lines("5.3e6,5e5"), local(_crs="EPSG:32632"), "far outside of the area of 'EPSG:32632'.*swapped"),
     # Levels
     (along(-120, -60, -75), local(_level_unit=None),
      r"column l: level_unit is not given; allowed are dBm, mW and W.*dB.*run from -120 to -60, median -75"),
