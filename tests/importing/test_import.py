@@ -83,14 +83,6 @@ def test_a_site_table_declares_the_radios_and_brings_the_files_of_antennas(tmp_p
     assert (first.antenna.azimuth_deg, first.antenna.tilt_deg) == (30.0, -4.0) and second.antenna is None
 
 
-@pytest.mark.parametrize("place", ["-3.489,-56.16", "34.89,-56.16", "-56.16,-34.89"])
-def test_sites_with_a_slip_are_refused(bring_in, tmp_path, place):
-    (tmp_path / "sites.csv").write_text(f"device,lat,lon\na,{place}\n")
-    with pytest.raises(BadInput, match=r"sites.csv: device 'a' at latitude .* km from the middle .*(slipped|sign|swapped)"):
-        bring_in("d,l,la,lo\na,-80,-34.9,-56.2\n", columns={"device": "d", "level": "l", "latitude": "la", "longitude": "lo"},
-                 devices=str(tmp_path / "sites.csv"))
-
-
 def test_heights_frequencies_and_dates_of_a_file_name(bring_in, local):
     columns = local | {"above_ground": "by file", "frequency_hz": "by file", "time": "{file date} {t}"}
     text = "device,x,y,level,t\na,0,0,-80,10:00:00\n"

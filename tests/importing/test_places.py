@@ -2,9 +2,7 @@
 
 import numpy as np
 import pandas as pd
-import pytest
 
-from radiotwin.errors import BadInput
 from radiotwin.importing.repeats import stay_representatives
 from radiotwin.importing.units import clock_notes
 
@@ -14,30 +12,6 @@ GIVEN = {"columns": COLUMNS, "length_unit": "m", "time_format": "ISO 8601", "tim
 
 def log(*times):
     return "t,device,x,y,level\n" + "".join(f"2024-03-01 {time},b,{i},0,-8{i}\n" for i, time in enumerate(times))
-
-
-@pytest.mark.parametrize(("table", "message"), [
-    ("device,x,y,since,until\nb,1,2,2024-03-01 12:00,2024-03-01 11:00\n", "is not before the time until which"),
-    ("device,x,y,since\nb,1,2,noon\n", "'noon' is no time in the form ISO 8601"),
-    ("device,x,y\nb,1,2\nb,3,4\n", "'b' occurs twice")])
-def test_periods_that_cannot_be_used(bring_in, tmp_path, table, message):
-    (tmp_path / "sites.csv").write_text(table)
-    with pytest.raises(BadInput, match=message):
-        bring_in(log("10:00"), devices=str(tmp_path / "sites.csv"), **GIVEN)
-
-
-def test_places_over_time_need_times(bring_in, tmp_path):
-    (tmp_path / "sites.csv").write_text("device,x,y,since\nb,1,2,2024-03-01 12:00\nb,3,4,2024-03-01 13:00\n")
-    columns = {name: spec for name, spec in COLUMNS.items() if name != "time"}
-    with pytest.raises(BadInput, match="'b' is at several places over time, and some of its readings have no time"):
-        bring_in(log("10:00"), devices=str(tmp_path / "sites.csv"), columns=columns, length_unit="m", time_zone="UTC")
-
-
-def test_what_moves_all_the_time_has_no_places(bring_in):
-    text = "device,x,y,level,dx,dy\n" + "".join(f"b,{i},0,-80,{100 * i},0\n" for i in range(1100))
-    columns = {"level": "level", "device": "device", "x": "x", "y": "y", "device_x": "dx", "device_y": "dy"}
-    with pytest.raises(BadInput, match="more than 1000 places that are 5 m apart: it moves all the time"):
-        bring_in(text, columns=columns, length_unit="m", place_m=5.0)
 
 
 def links_of(x_m, level_db, **columns):

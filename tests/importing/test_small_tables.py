@@ -253,13 +253,17 @@ CASES = {
 }
 
 
+def written(folder, given, files=()):
+    """Write the tables of positions that settings name; return these settings, with the folder."""
+    for file in files:
+        (folder / file).write_text(files[file])
+    return {key: str(folder / given[key]) for key in ("devices", "receivers") if key in given}
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_a_table(bring_in, tmp_path, name):
     case = CASES[name]
-    for file, content in case.files.items():
-        (tmp_path / file).write_text(content)
-    tables = {key: str(tmp_path / case.given[key]) for key in ("devices", "receivers") if key in case.given}
-    result = bring_in(case.text, **case.given | tables)
+    result = bring_in(case.text, **case.given | written(tmp_path, case.given, case.files))
     for expected, found in ((case.table, result.table), (case.devices, result.devices)):
         for column, values in expected.items():
             assert found[column].tolist() == pytest.approx(values, rel=1e-12, abs=1e-9, nan_ok=True), column
@@ -276,7 +280,7 @@ def lines(*cells):
 
 
 ONE, CLOCK = lines("0,0"), "t,x,y,d,l\n23:59:58,0,0,a,-80\n"
-REFUSED = [  # text, settings, words of the message
+REFUSED = [  # text, settings, words of the message, and tables
     # Columns
     (ONE, local(level="rsrp"), r"column 'rsrp' \(level\) is missing; the file has x, y, d, l"),
     (ONE, local(time="{day} {minute}", device="{d}-{lac}"), r"columns 'lac' \(device\), 'day' \(time\), 'minute' \(time\) are missing"),
@@ -316,6 +320,18 @@ REFUSED = [  # text, settings, words of the message
     (ONE, local(_crs="+init=/etc/passwd:1"), "is unknown.*AUTHORITY:CODE"),
     (lines("11,48"), local(_crs="EPSG:32632"), "x, y = 11, 48 is latitude 0.000, longitude 4.511, far outside"),
     (lines("5.3e6,5e5"), local(_crs="EPSG:32632"), "far outside of the area of 'EPSG:32632'.*swapped"),
+    *((clock("2024-03-01 10:00", device="b"), local(time="t", y="always 0", _time_format="ISO 8601", _devices="sites.csv"), message,
+       {"sites.csv": sites}) for message, sites in (
+        ("is not before the time until which", "device,x,y,since,until\nb,1,2,2024-03-01 12:00,2024-03-01 11:00\n"),
+        ("'noon' is no time in the form ISO 8601", "device,x,y,since\nb,1,2,noon\n"),
+        ("'b' occurs twice", "device,x,y\nb,1,2\nb,3,4\n"))),
+    (ONE, local(_devices="sites.csv"), "'a' is at several places over time, and some of its readings have no time",
+     {"sites.csv": "device,x,y,since\na,1,2,2024-03-01 12:00\na,3,4,2024-03-01 13:00\n"}),
+    ("x,y,d,l,dx\n" + "".join(f"{i},0,b,-80,{100 * i}\n" for i in range(1100)), local(device_x="dx", device_y="y", _place_m=5.0),
+     "more than 1000 places that are 5 m apart: it moves all the time"),
+    *((PLACES + "a,-34.9,-56.2,-80\n", BY_PLACE | {"devices": "sites.csv"}, f"sites.csv: device 'a' at latitude .* km from the middle .*{slip}",
+       {"sites.csv": f"device,lat,lon\na,{place}\n"})
+      for place, slip in (("-3.489,-56.16", "slipped"), ("34.89,-56.16", "sign"), ("-56.16,-34.89", "swapped"))),
     # Levels
     (along(-120, -60, -75), local(_level_unit=None),
      r"column l: level_unit is not given; allowed are dBm, mW and W.*dB.*run from -120 to -60, median -75"),
@@ -338,8 +354,9 @@ REFUSED = [  # text, settings, words of the message
     (CLOCK, local(time="t", _time_format="%Y-%m-%d %I:%M:%S"), "%p .AM, PM. belongs to %I")]
 
 
-@pytest.mark.parametrize(("text", "given", "message"), REFUSED)
-def test_a_table_that_cannot_be_imported(bring_in, tmp_path, text, given, message):
+@pytest.mark.parametrize("row", REFUSED, ids=lambda row: row[2][:40])
+def test_a_table_that_cannot_be_imported(bring_in, tmp_path, row):
+    text, given, message, *files = row
     with pytest.raises(BadInput, match=message):
-        bring_in(text, **{"time_zone": "UTC"} | given)
+        bring_in(text, **{"time_zone": "UTC"} | given | written(tmp_path, given, *files))
     assert not (tmp_path / "out").exists()
