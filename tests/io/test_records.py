@@ -6,7 +6,7 @@ import pytest
 from pydantic import Field
 
 from radiotwin.errors import BadInput
-from radiotwin.io.forms import Real, Record, Whole, check_size, read_record, validated
+from radiotwin.io.forms import Real, Record, Whole, read_record, validated
 
 
 class Part(Record):
@@ -46,10 +46,3 @@ def test_records_have_limits(tmp_path, text, words):
     (tmp_path / "x.json").write_text(text)
     with pytest.raises(BadInput, match=words):
         read_record(tmp_path / "x.json", "record")
-
-
-def test_a_limit_is_raised_by_its_variable(monkeypatch):
-    monkeypatch.setenv("RADIOTWIN_MAX_ENTRIES", "3")
-    check_size({"a": [1, 2, 3]}, "x.json")
-    with pytest.raises(BadInput, match="4 entries; at most 3"):
-        check_size({"a": [1, 2, 3, 4]}, "x.json")

@@ -25,15 +25,12 @@ def test_data_for_a_script_keeps_its_arrays():
         "name": r"\x1b", "values": packed, "list": [r"\u202e", 1, None]}
 
 
-@pytest.mark.parametrize("share, text", [(0, "0%"), (1e-6, "under 1%"), (0.0099, "under 1%"), (0.01, "1%"), (0.5, "50%"),
-                                         (0.99, "99%"), (0.9999, "over 99%"), (1, "100%")])
-def test_no_share_is_rounded_to_nothing_or_all(share, text):
-    assert percent(share) == text
-
-
-@pytest.mark.parametrize("value, text", [(0.8, "0.8"), (123.4, "123"), (6012.0, "6,012"), (-1e5, "-100,000")])
-def test_numbers_have_three_digits_or_all_before_the_point(value, text):
-    assert shortly(value) == text
+@pytest.mark.parametrize("form, value, text", [
+    *((percent, share, text) for share, text in (  # no share is rounded to nothing or all
+        (0, "0%"), (1e-6, "under 1%"), (0.0099, "under 1%"), (0.01, "1%"), (0.5, "50%"), (0.99, "99%"), (0.9999, "over 99%"), (1, "100%"))),
+    (shortly, 0.8, "0.8"), (shortly, 123.4, "123"), (shortly, 6012.0, "6,012"), (shortly, -1e5, "-100,000")])
+def test_numbers_for_a_reader(form, value, text):
+    assert form(value) == text
 
 
 def test_names_in_figures_are_no_formulas_and_short():
