@@ -162,15 +162,14 @@ CASES = {
     "tables of sites in words of their own": Case(
         "d,l,r\n262-01-9,-80,r1\n262-1-8,-81,r1\n", local(x=None, y=None, receiver="r", _devices="sites.csv", _receivers="roofs.csv",
                                                            _length_unit=None), {"receiver_above_ground_m": [3.048] * 2},
-        {"device": ["262-01-9", "262-1-8"], "above_ground_m": [30.48, 27.432], "azimuth_deg": [120, 0], "tilt_deg": [-6, 0],
-         "eirp_dbm": [60, 50], "frequency_hz": [1.8e9, 8e8]}, says="sites.csv: column not used: Owner",
+        {"device": ["262-01-9", "262-1-8"], "above_ground_m": [NAN, 27.432], "azimuth_deg": [NAN, 0], "tilt_deg": [NAN, 0],
+         "eirp_dbm": [NAN, 50], "frequency_hz": [NAN, 8e8]}, says="1 of 2 names occur in no row of the log: 262-1-9 (262-01-9 there)",
         files={"sites.csv": "Cell ID;Lat;Long;Antenna Height (ft);Azimuth;Downtilt;EIRP (W);Freq (MHz);Owner\n"
                             "262-1-9;48,105;11,5;100;120;6;1000;1800;me\n262-1-8;48,1;11,5;90;0;0;100;800;me\n",
                "roofs.csv": "Station,lat,lng,mast height ft,colour\nr1,48.1,11.5,10,red\n"}),
-    "a name of the log that differs from that of the table": Case(
-        HEAD + "0,0,262-01-9,-80\n", local(_devices="sites.csv"),
-        says="1 of 1 names occur in no row of the log: 262-1-9 (262-01-9 there)",
-        files={"sites.csv": "device,x,y\n262-1-9,1,1\n"}),
+    "columns of tables of sites that are not used": Case(
+        HEAD + "0,0,a,-80\n", local(_devices="sites.csv"), says="sites.csv: column not used: Owner",
+        files={"sites.csv": "device,x,y,Owner\na,1,1,me\n"}),
     # Levels
     "milliwatts": Case(along("1e-9"), local(_level_unit="mW", _level_offset_db=3.0), {"rssi_dbm": [-87]}),
     "watts": Case(along("1e-9"), local(_level_unit="W"), {"rssi_dbm": [-60]}),
