@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from pydantic import field_validator
 
+from radiotwin.closeloop.output.result_file import for_json
 from radiotwin.display import plain
 from radiotwin.errors import BadInput
 from radiotwin.io.cells import write_csv
@@ -159,9 +160,10 @@ def write_comparison(comparison: Comparison, scene: Scene, folder: Path | str) -
     needed, files of these names are replaced.
     """
     folder = Path(folder)
-    record = {"schema": SCHEMA, "scene": scene.config.name, "scores": _rows(comparison.scores),
-              "locations": _rows(comparison.locations),
-              "location_summary": _rows(comparison.location_summary())}
+    record = for_json({"schema": SCHEMA, "scene": scene.config.name,
+                       "scores": comparison.scores.to_dict("records"),
+                       "locations": comparison.locations.to_dict("records"),
+                       "location_summary": comparison.location_summary().to_dict("records")})
     with atomic_path(folder / "compare.json") as temporary:
         temporary.write_text(json.dumps(record, indent=1, allow_nan=False), encoding="utf-8")
     for name, table in (("scores.csv", comparison.scores), ("locations.csv", comparison.locations),
@@ -187,12 +189,6 @@ def read_comparison(path: Path) -> Comparison:
         numbers = [name for name in table if name.endswith(("_db", "_m"))]
         table[numbers] = table[numbers].astype(float)
     return Comparison(scores, locations, {}, pd.DataFrame())
-
-
-def _rows(table: pd.DataFrame) -> list[dict]:
-    """Convert a table to rows for JSON; NaN and infinity become null."""
-    return [{key: None if isinstance(value, float) and not np.isfinite(value) else value
-             for key, value in row.items()} for row in table.to_dict("records")]
 
 
 def write_comparison_figures(comparison: Comparison, scene: Scene, truth: RadioMap | None,

@@ -78,13 +78,6 @@ def test_an_azimuth_at_north_has_a_narrow_interval():
     assert azimuth.determined and azimuth.high - azimuth.low < 90.0 and holds(azimuth, 2.0)
 
 
-def test_the_position_of_a_mast_is_held():
-    moved_m = MASTS_M.copy()
-    moved_m[1, :2] += (30.0, -20.0)
-    (found,) = effect_parameters(fitted(drive(1), DevicePositionError(), devices_m=moved_m))
-    assert holds(found["x_m[d1]"], MASTS_M[1, 0]) and holds(found["y_m[d1]"], MASTS_M[1, 1])
-
-
 def test_folds_follow_no_paths_of_their_own_for_intervals(monkeypatch):
     """What moving a mast does is followed over the whole; each fold looks at that on its own links."""
     moved_m = MASTS_M.copy()

@@ -130,7 +130,7 @@ def make_report(loop: Loop) -> dict[str, Any]:
                  for name, mean_db in predicted.baselines.items()}
     combination = [{"name": SCHEMA_NAMES.get(name, name), "weight_near": near, "weight_far": far}
                    for name, (near, far) in predicted.combination.weights.items()]
-    return _for_json({
+    return for_json({
         "schema": SCHEMA, "radiotwin_version": __version__, "base": loop.base,
         "verdict": loop.verdict, "effects": effects, "candidates": candidates,
         "anomalies": [_anomaly(each) | {"same_over": constant_over(each, loop.before)}
@@ -389,12 +389,12 @@ def _groups(links: Links) -> dict[str, dict[str, np.ndarray]]:
     return groups
 
 
-def _for_json(value: Any) -> Any:
+def for_json(value: Any) -> Any:
     """Convert NaN and inf to None and NumPy numbers to Python's, also within dicts and lists."""
     if isinstance(value, dict):
-        return {name: _for_json(each) for name, each in value.items()}
+        return {name: for_json(each) for name, each in value.items()}
     if isinstance(value, list | tuple):
-        return [_for_json(each) for each in value]
+        return [for_json(each) for each in value]
     if isinstance(value, float | np.floating):
         return float(value) if np.isfinite(value) else None
     return value.item() if isinstance(value, np.generic) else value
