@@ -207,12 +207,18 @@ class Campaign:
             return
         if measured is None:
             assert self.reality is not None and learner is not None
-            self.reality.fly(measuring_policy(run, self.reality, self.twin, self.known, learner,
-                                              rng), self.known)
+            self.reality.fly(self.measuring_policy(learner, rng), self.known)
             measured = self.reality.measurements()
         self._see(fit_twin(measured, self.scene, model=TWINS[run.twin], seed=run.seed,
                            start=self.twin))
         self.learn_s = time.perf_counter() - started
+
+    def measuring_policy(self, learner: Learner, rng: np.random.Generator) -> Policy:
+        """Return who flies the next real flight: random cells in turn, chance, or the learner."""
+        kind = self.run.measure if self.twin is not None else self.run.first_flight
+        if kind == "waypoints":
+            return PlanPolicy(waypoint_actions(self.scene, self.in_truth(), rng))
+        return HeuristicPolicy("random", rng) if self.twin is None else learner.policy(rng)
 
     def log(self, learner: Learner, mission: Mission, rng: np.random.Generator,
             simulated: int) -> None:
@@ -366,15 +372,6 @@ def location_errors_m(scene: Scene, known: Known) -> np.ndarray:
     return np.array([
         np.hypot(*np.subtract(known.position_m.get(d.device, missing), (d.x_m, d.y_m)))
         for d in scene.config.devices if d.role == "unknown"])
-
-
-def measuring_policy(run: RunSettings, reality: Reality, twin: Twin | None, known: Known,
-                     learner: Learner, rng: np.random.Generator) -> Policy:
-    """Return the policy of the next real flight: between random cells, random, or the learner's."""
-    kind = run.measure if twin is not None else run.first_flight
-    if kind == "waypoints":
-        return PlanPolicy(waypoint_actions(reality.scene, reality.mission(known), rng))
-    return HeuristicPolicy("random", rng) if twin is None else learner.policy(rng)
 
 
 def _summary(row: dict, run: RunSettings) -> str:

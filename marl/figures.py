@@ -38,7 +38,7 @@ def trajectories_figure(scene: Scene, mission: Mission, flights: Flights, flight
                         known: Known | None) -> Figure:
     """Draw the trajectories of one flight over the city, with a panel for each UAV.
 
-    `known` are device positions that the UAVs knew; None: they are not drawn.
+    `known` are device positions that the UAVs knew; None: the scene's.
     """
     x_min, x_max, y_min, y_max = scene.config.extent.bounds
     width_in = 5.6 * min(max((x_max - x_min) / (y_max - y_min), 0.6), 1.6)

@@ -60,15 +60,7 @@ class PlanSettings:
 
 @dataclass(frozen=True, eq=False)
 class PlannedFlights:
-    """A plan with its inputs and predicted share of data.
-
-    Attributes:
-        scene: scene with the UAVs that fly, and with the twin's device positions.
-        mission: mission in the twin's map.
-        prior: uncertainty of the twin.
-        promised: the plan, and the shares that it collects in possible worlds.
-        sizes: result of the sizing; empty if it was not requested.
-    """
+    """A plan in the twin's map, with its predicted share of data; `scene` has the UAVs that fly."""
 
     scene: Scene
     mission: Mission

@@ -128,14 +128,9 @@ def _quantiles(share: np.ndarray) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Size:
-    """One configuration of a mission, and the predicted share of data.
+    """A number of UAVs with a battery each [moves] and a base, and quantiles of the share of data.
 
-    Attributes:
-        uavs: number of UAVs.
-        battery: battery of each UAV [moves].
-        base: name of the base, or `all`.
-        p10, p50, p90: quantiles of the collected share.
-        chance: share of worlds in which the wanted share is collected.
+    `chance` is the share of worlds in which the wanted share is collected.
     """
 
     uavs: int

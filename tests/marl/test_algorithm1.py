@@ -12,7 +12,6 @@ from marl.algorithm1 import (
     Campaign,
     Reality,
     location_errors_m,
-    measuring_policy,
     run_algorithm,
 )
 from marl.flights import evaluate
@@ -166,14 +165,14 @@ def test_location_errors_are_the_twins_even_if_agents_see_true_positions(small_s
 @pytest.mark.parametrize("measure, first_flight, is_first, planned", [
     ("policy", "waypoints", True, True), ("policy", "random", True, False),
     ("waypoints", "random", False, True), ("policy", "waypoints", False, False)])
-def test_who_flies_a_real_flight(small_scene, reality, measure, first_flight, is_first, planned):
+def test_who_flies_a_real_flight(small_scene, measure, first_flight, is_first, planned):
     class Trained:
         def policy(self, rng):
             return "its own"
 
-    run = run_settings(measure=measure, first_flight=first_flight)
-    policy = measuring_policy(run, reality, None if is_first else "a twin", Known.anchors(small_scene), Trained(),
-                              np.random.default_rng(0))
+    campaign = Campaign(run_settings(measure=measure, first_flight=first_flight), small_scene, segmented_truth(small_scene))
+    campaign.twin = None if is_first else "a twin"
+    policy = campaign.measuring_policy(Trained(), np.random.default_rng(0))
     assert isinstance(policy, PlanPolicy) == planned
     assert planned or (isinstance(policy, HeuristicPolicy) if is_first else policy == "its own")
 
