@@ -14,7 +14,7 @@ import pytest
 
 import radiotwin as rt
 from radiotwin.cli.commands import app
-from tests.worlds import quickened
+from tests.worlds import leave_effects, quickened, thinned
 
 ROOT = Path(__file__).parents[1]
 # Command -> functions of `rt` that do its work; a command calls them, or (after the arrow) what they call, too.
@@ -47,13 +47,18 @@ def test_every_name_is_there_for_people_and_for_type_checkers():
 
 @pytest.fixture(scope="module")
 def documented(tmp_path_factory):
-    """The names that all snippets of docs/python.md leave, run one after another in an empty folder, and the folder."""
+    """The names that all snippets of docs/python.md leave, run one after another in an empty folder, and the folder.
+
+    Of the flights every fourth moment, and of the effects two: all take minutes.
+    """
     folder, text = tmp_path_factory.mktemp("documented"), (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
     snippets = re.findall(r"```py.*?\n(.*?)```", text, re.DOTALL)
     assert len(snippets) == text.count("```") / 2 == 8
     matplotlib.use("Agg")
-    names, printed = {}, io.StringIO()
-    with quickened(), contextlib.chdir(folder), contextlib.redirect_stdout(printed):
+    names, printed, fly = {}, io.StringIO(), rt.fly_survey
+    with quickened(), contextlib.chdir(folder), contextlib.redirect_stdout(printed), pytest.MonkeyPatch.context() as patch:
+        leave_effects(patch, "receiver_gain_offset", "noise_floor_censoring")
+        patch.setattr("radiotwin.maps.survey.fly_survey", lambda *given, **more: thinned(fly(*given, **more), 4))
         for snippet in snippets:
             exec(compile(snippet, "docs/python.md", "exec"), names)
     return names, folder / "quick", printed.getvalue()
@@ -101,6 +106,8 @@ def called_by(module_path, function):
                 names.update(alias.name for alias in node.names)
             elif isinstance(node, ast.Name):
                 names.add(node.id)
+            elif isinstance(node, ast.Attribute) and ast.unparse(node.value) == "rt":
+                names.add(node.attr)
         waiting += [each for each in names & bodies.keys() if each not in seen]
     return names
 

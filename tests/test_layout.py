@@ -99,10 +99,11 @@ def test_a_package_imports_only_what_is_below_it(part):
 
 
 def test_of_the_top_level_only_the_version_is_imported():
-    """A circle through its names, which are loaded late, would not be seen."""
-    wrong = {f"{module} imports {name}" for module in in_package("radiotwin") for name in IMPORTS[module]
+    """Except by the commands, which nothing imports: a circle through its names, which are loaded late, would not be seen."""
+    below = [module for module in in_package("radiotwin") if part_of(module) != "cli"]
+    wrong = {f"{module} imports {name}" for module in below for name in IMPORTS[module]
              if target(name) == "radiotwin" and name not in ("radiotwin", "radiotwin.__version__")}
-    read = {f"{module} reads {node.value.id}.{node.attr}" for module in in_package("radiotwin")
+    read = {f"{module} reads {node.value.id}.{node.attr}" for module in below
             if "radiotwin" in IMPORTS[module] for node in ast.walk(ast.parse(MODULES[module].read_text()))
             if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "radiotwin"
             and node.attr != "__version__"}

@@ -26,21 +26,21 @@ RBM = Path(__file__).parents[1] / "scenes" / "rbm"
 IN_A_NARROW_STREET = "d4"
 
 
-def fly(seed, noise_db=2.0, limit_db=-110.0):
+def fly(seed, noise_db=2.0, limit_db=-110.0, flights=FLIGHTS, slots=SLOTS, devices=DEVICES):
     """Fly over open ground: arrays of links, to be changed, with gain = -35 - 26 log10(d) + noise."""
     rng = np.random.default_rng(seed)
-    device_m = np.column_stack([rng.uniform(0, 500, (DEVICES, 2)), np.full(DEVICES, 1.5)])
+    device_m = np.column_stack([rng.uniform(0, 500, (devices, 2)), np.full(devices, 1.5)])
     rows = []
-    for flight in range(FLIGHTS):
+    for flight in range(flights):
         for receiver in range(RECEIVERS):
             position_m, heading = rng.uniform(100, 400, 2), rng.uniform(0, 2 * np.pi)
-            for slot in range(SLOTS):
+            for slot in range(slots):
                 heading += rng.normal(0, 0.25)
                 if np.abs(position_m - 250).max() > 240:
                     heading = np.arctan2(*(250 - position_m))
                 position_m = position_m + 10 * np.array([np.sin(heading), np.cos(heading)])
                 rows += [(flight, receiver, device, 200.0 * flight + slot, slot, *position_m, 50.0 + 10 * receiver,
-                          np.degrees(heading) % 360) for device in range(DEVICES)]
+                          np.degrees(heading) % 360) for device in range(devices)]
     flight, receiver, device, time_s, slot, x, y, z, heading_deg = np.array(rows).T
     flight, receiver, device = (value.astype(int) for value in (flight, receiver, device))
     receiver_m = np.column_stack([x, y, z])
@@ -61,10 +61,15 @@ def measured(world, **columns):
         "receiver": [f"r{i}" for i in world.receiver],
         **{f"receiver_{axis}_m": world.receiver_m[:, i] for i, axis in enumerate("xyz")},
         "device": [f"d{i}" for i in world.device], "gain_db": gain_db, "heading_deg": world.heading_deg} | columns)
-    devices = pd.DataFrame({"device": [f"d{i}" for i in range(DEVICES)], "x_m": world.device_m[:, 0],
+    devices = pd.DataFrame({"device": [f"d{i}" for i in range(len(world.device_m))], "x_m": world.device_m[:, 0],
                             "y_m": world.device_m[:, 1], "z_m": world.device_m[:, 2], "role": "anchor",
                             "frequency_hz": 2.4e9})
     return Measurements(table, devices)
+
+
+def thinned(flown, step):
+    """Return every moment of that number of some measurements."""
+    return flown.select(np.unique(flown.table["time_s"], return_inverse=True)[1] % step == 0)
 
 
 @pytest.fixture(scope="session")
@@ -130,9 +135,9 @@ def narrow_street():
     scene = Scene.load(RBM)
     flown = fly_survey(scene, RadioMap.load(RBM / "truth.nc"), flights=3, pattern="random-waypoint", seed=0,
                        noise_db=1.0)
+    flown = thinned(flown, 3)
     devices = flown.devices[(flown.devices["role"] == "anchor") | (flown.devices["device"] == IN_A_NARROW_STREET)]
-    every_third = np.unique(flown.table["time_s"], return_inverse=True)[1] % 3 == 0
-    links = flown.table[flown.table["device"].isin(devices["device"]) & every_third]
+    links = flown.table[flown.table["device"].isin(devices["device"])]
     position_m = next(np.array([each.x_m, each.y_m]) for each in scene.config.devices
                    if each.device == IN_A_NARROW_STREET)
     return SimpleNamespace(scene=scene, name=IN_A_NARROW_STREET, position_m=position_m, measured=Measurements(

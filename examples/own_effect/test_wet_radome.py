@@ -26,15 +26,15 @@ def effect(monkeypatch):
     return register(WetRadome)
 
 
-def made(loss_db):
+def made(loss_db, slots=100):
     """Measurements of 2 receivers and 4 devices in 1200 s: a log-distance law, noise, and rain."""
     rng = np.random.default_rng(0)
     device_m = np.column_stack([rng.uniform(0, 400, (4, 2)), np.full(4, 1.5)])
-    axes = np.meshgrid(np.arange(300), [0, 1], [0, 1, 2, 3])
+    axes = np.meshgrid(np.arange(slots), [0, 1], [0, 1, 2, 3])
     slot, receiver, device = (axis.ravel() for axis in axes)
-    ground_m = rng.uniform(0, 400, (300, 2, 2)).reshape(600, 2)
-    receiver_m = np.column_stack([ground_m, np.full(600, 50.0)])
-    position_m, time_s = receiver_m[2 * slot + receiver], 4.0 * slot
+    ground_m = rng.uniform(0, 400, (2 * slots, 2))
+    receiver_m = np.column_stack([ground_m, np.full(2 * slots, 50.0)])
+    position_m, time_s = receiver_m[2 * slot + receiver], 1200.0 / slots * slot
     gain_db = -35 - 26 * np.log10(np.linalg.norm(position_m - device_m[device], axis=1))
     gain_db += rng.normal(0, 2, len(gain_db)) - loss_db * ((time_s >= START_S) & (time_s <= END_S))
     table = pd.DataFrame({
@@ -78,7 +78,7 @@ def test_what_pages_say_of_it(effect):
 def test_a_crane_has_a_place(monkeypatch):
     monkeypatch.syspath_prepend(str(Path(__file__).parent))
     from crane import Crane
-    links = prepare_links(made(0.0), None)
+    links = prepare_links(made(0.0, slots=300), None)
     crane = Crane().with_params(Crane.Params(place_m=(200.0, 200.0)))
     through = crane.term(links, None).columns[:, 0] < 0
     assert 10 < through.sum() < 0.2 * len(links) and crane.reach(links)[through].all()

@@ -8,7 +8,6 @@ parent process then reports the command and the file, and exits with 2.
 import os
 import signal
 import sys
-from functools import partial
 
 from radiotwin.errors import BadInput
 from radiotwin.io import signals
@@ -24,7 +23,9 @@ def main() -> None:
     """Run the command line, and end the process with the command's exit status."""
     signals.handle()  # before anything that takes time
     if sys.argv[1:2] and sys.argv[1] in GUARDED:
-        _guard()
+        status = go_on_in_a_child()
+        if status is not None:
+            signals.leave(status)
     # Our matrices are small: several BLAS threads are slower than one, and wait busily. Parallel
     # work has threads and workers of its own. OpenBLAS reads the variable when it is loaded.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -35,34 +36,12 @@ def main() -> None:
     signals.leave(exit_status(app, after_interrupt))
 
 
-def _guard() -> None:
-    """Let a child process run the command: return in it, and end the parent with its exit status.
-
-    Where no child can be made safely, this process returns and runs the command itself.
-    """
-    try:
-        status = go_on_in_a_child()
-    except BadInput as error:
-        from radiotwin.runtime.command import exit_status
-
-        status = exit_status(partial(_refuse, error), "")
-    if status is not None:
-        signals.leave(status)
-
-
-def _refuse(error: BadInput) -> None:
-    raise error
-
-
 def go_on_in_a_child() -> int | None:
     """Fork; return None in the child, and the child's exit status in the parent.
 
     Where a fork is not safe (not on Linux, or once NumPy has made threads), return None in this
     process. Signals are passed on to the child. A signal that ends the child, other than a crash,
     ends the parent, too.
-
-    Raises:
-        BadInput: a library crashed the child.
     """
     if sys.platform != "linux" or "numpy" in sys.modules:
         return None
@@ -77,9 +56,14 @@ def go_on_in_a_child() -> int | None:
     _, status = os.waitpid(child, 0)
     code = os.waitstatus_to_exitcode(status)
     if -code in CRASHES:
-        raise BadInput(f"{' '.join(sys.argv[1:3])}: a library ended on this file "
-                       f"({signal.strsignal(-code)}): it breaks what its format promises. Export "
-                       "it again, and please report it with the file")
+        from radiotwin.runtime.command import exit_status
+
+        def refuse() -> None:
+            raise BadInput(f"{' '.join(sys.argv[1:3])}: a library ended on this file "
+                           f"({signal.strsignal(-code)}): it breaks what its format promises. "
+                           "Export it again, and please report it with the file")
+
+        return exit_status(refuse, "")
     if code < 0:  # killed from outside, or out of memory
         if -code != signal.SIGKILL:
             signal.signal(-code, signal.SIG_DFL)

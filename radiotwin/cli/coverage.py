@@ -3,10 +3,11 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any
 
 import typer
 
+import radiotwin as rt
 from radiotwin.cli.options import (
     OnlyDevices,
     OptionalScene,
@@ -16,13 +17,9 @@ from radiotwin.cli.options import (
     split_names,
 )
 from radiotwin.errors import BadInput
+from radiotwin.io.files import atomic_folder, require_folder
+from radiotwin.io.inputs import keep_inputs
 from radiotwin.runtime.console import print_rows, result, say
-
-if TYPE_CHECKING:
-    from radiotwin.coverage import Coverage
-    from radiotwin.maps.radiomap import RadioMap
-    from radiotwin.scene import Scene
-    from radiotwin.twin import Twin
 
 
 def coverage(
@@ -82,14 +79,12 @@ def coverage(
 
     Received power, best server, SNR, SINR, rate and covered shares on a street-level grid.
     """
-    from radiotwin.coverage import CoverageSettings, RateModel, predict_coverage, read_transmitters
+    from radiotwin.coverage import RateModel, read_transmitters
     from radiotwin.coverage.areas import read_areas
     from radiotwin.coverage.output import FILES, available_formats, write_formats, write_tables
-    from radiotwin.io.files import atomic_folder, require_folder
-    from radiotwin.io.inputs import keep_inputs
     from radiotwin.report import write_coverage_pictures
 
-    settings = CoverageSettings(
+    settings = rt.CoverageSettings(
         height_m=height, step_m=step, extent_m=parse_extent(extent), tx_power_dbm=tx_power_dbm,
         bandwidth_hz=bandwidth_hz, noise_figure_db=noise_figure_db, load=load,
         threshold_dbm=threshold_dbm, reliability=reliability, indoor_loss_db=indoor_loss_db,
@@ -104,30 +99,26 @@ def coverage(
     areas = read_areas(polygon, world) if polygon else []
     table = read_transmitters(transmitters, world) if transmitters else None
     with _gains(source, world, model) as gains:
-        found = predict_coverage(gains, world, table, settings, areas, split_names(devices))
+        found = rt.predict_coverage(gains, world, table, settings, areas, split_names(devices))
     with atomic_folder(out) as folder:
         write_tables(found, folder)
         write_formats(found, world, folder, usable)
         if "png" in usable:
             write_coverage_pictures(found, world, folder)
-    _print(found)
+    _print(found.summary)
     for note in (*found.summary["notes"], *notes):
         say(f"note: {note}")
     say(f"wrote {out}: {', '.join(sorted(path.name for path in out.iterdir()))}")
 
 
-def _world(source: Path, scene: Path | None, model: str | None) -> "Scene":
-    """Load the scene of a coverage source: the source itself, or --scene for a twin or radio map.
-
-    BadInput if --scene is missing, or if --scene or --model does not go with the source.
-    """
+def _world(source: Path, scene: Path | None, model: str | None) -> "rt.Scene":
+    """Load the scene of a coverage source: the source itself, or --scene for a twin or map."""
     from radiotwin.maps.file import is_map
-    from radiotwin.scene import Scene
 
     if (source / "scene.toml").exists():
         if scene is not None:
             raise BadInput(f"{source} is a scene already; leave --scene out")
-        return Scene.load(source)
+        return rt.Scene.load(source)
     if model is not None:
         raise BadInput(f"--model is for a scene without measurements, and {source} is none; leave "
                        "it out, or give the scene's folder in place of it")
@@ -136,27 +127,26 @@ def _world(source: Path, scene: Path | None, model: str | None) -> "Scene":
                        "folder, a radio map, or a scene's folder")
     if scene is None:
         raise BadInput(f"{source} needs the scene's 3D map; give its folder with --scene")
-    return Scene.load(scene)
+    return rt.Scene.load(scene)
 
 
 @contextmanager
-def _gains(source: Path, world: "Scene", model: str | None) -> "Iterator[Twin | RadioMap | str]":
+def _gains(source: Path, world: "rt.Scene",
+           model: str | None) -> "Iterator[rt.Twin | rt.RadioMap | str]":
     """Yield the source of gains: an opened twin or radio map, or for a scene the name of a law."""
     from radiotwin.maps.export.tables import check_map_place
-    from radiotwin.maps.radiomap import RadioMap
 
     if (source / "scene.toml").exists():
         yield model or "p1411"
         return
     with open_model(source) as opened:
-        if isinstance(opened, RadioMap):
+        if isinstance(opened, rt.RadioMap):
             check_map_place(str(source), opened.attributes, world)
         yield opened
 
 
-def _print(found: "Coverage") -> None:
+def _print(facts: dict[str, Any]) -> None:
     """Print a prediction's assumptions, covered shares of areas, and share of each server."""
-    facts = found.summary
     result("coverage", facts)
     above = "above the ground" if facts["above_ground"] else "above the datum"
     say(f"{facts['model']}; {facts['cells']:,} cells of {facts['step_m']:g} m, receivers "

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+import radiotwin as rt
 from radiotwin.cli.options import (
     MAX_SEED,
     Cluster,
@@ -25,11 +26,12 @@ from radiotwin.cli.options import (
     split_names,
 )
 from radiotwin.errors import BadInput
-from radiotwin.runtime.console import notice, print_rows, result, say
+from radiotwin.io.files import atomic_path, require_suffix, require_writable
+from radiotwin.io.inputs import keep_inputs, keep_others
+from radiotwin.runtime.console import notice, print_rows, progress, result, say
 
 if TYPE_CHECKING:
-    from radiotwin.twin import Twin, TwinDevice
-    from radiotwin.twin.compare import Comparison
+    from radiotwin.twin import TwinDevice
 
 
 def fit(
@@ -60,25 +62,22 @@ def fit(
     segmented_nn locates the unknown devices, and the model with the least held-out error predicts
     levels; any other model does both.
     """
-    from radiotwin.links.measurements import read_measurements
     from radiotwin.runtime.execution import open_executor
-    from radiotwin.runtime.pieces import keep_pieces
-    from radiotwin.scene import Scene
-    from radiotwin.twin import Twin, check_twin_target, fit_twin
+    from radiotwin.twin import check_twin_target
 
     check_twin_target(out)
-    data, world = read_measurements(measurements, devices), Scene.load(scene)
+    data, world = rt.read_measurements(measurements, devices), rt.Scene.load(scene)
     data = in_frame_of(world, data, shift)
-    earlier = Twin.load(start) if start else None
-    with keep_pieces() as pieces, open_executor(workers, cluster, notice) as executor:
-        twin = fit_twin(data, world, model, seed=seed, start=earlier, allow_indoor=allow_indoor,
+    earlier = rt.Twin.load(start) if start else None
+    with rt.keep_pieces() as pieces, open_executor(workers, cluster, notice) as executor:
+        twin = rt.fit_twin(data, world, model, seed=seed, start=earlier, allow_indoor=allow_indoor,
                         executor=executor, compare=True)
     notice(pieces.progress)
     twin.save(out)
     _print_twin(twin, f"Twin {out} ({twin.channel.name})")
 
 
-def _print_twin(twin: "Twin", title: str) -> None:
+def _print_twin(twin: "rt.Twin", title: str) -> None:
     """Print a twin's device positions, fitted law, and held-out errors of the channel models."""
     from radiotwin.twin.selection import LOCATED_BY, HeldOut
 
@@ -133,23 +132,21 @@ def map_(
     It holds the gain of every device over the scene's lattice.
     """
     from radiotwin.display import count
-    from radiotwin.io.inputs import keep_inputs, keep_others
     from radiotwin.maps.file import is_map
-    from radiotwin.report import check_map_target, export_map
-    from radiotwin.scene import Scene
+    from radiotwin.report import check_map_target
 
     if out is None and is_map(twin):
         raise BadInput(f"{twin} is a radio map already; give the file to write with --out")
     place = Path(os.path.realpath(twin))  # unlike resolve, it accepts circular links
     out = out or place.with_name(f"{place.name}.nc")
     heights_m = None if altitudes is None else parse_numbers("--altitudes", altitudes)
-    world = Scene.load(scene)
+    world = rt.Scene.load(scene)
     check_map_target(out, world)
     keep_inputs(out, twin, *world.files)
     keep_others(out, force, "device", "x_m", "y_m", "z_m", "gain_db", "los")
     with open_model(twin) as source:
-        written = export_map(source, world, out, devices=split_names(devices),
-                             altitudes_m=heights_m, name=str(twin), tell=notice)
+        written = rt.export_map(source, world, out, devices=split_names(devices),
+                                altitudes_m=heights_m, name=str(twin), tell=notice)
     z, y, x = written.lattice.shape
     say(f"wrote {out}: {count(len(written.devices), 'device')}, {count(z, 'altitude')} of {x} by "
         f"{y} positions")
@@ -182,31 +179,25 @@ def compare(
     Published laws that are valid at the scene's frequency are among them, without a fit.
     With --truth they are compared with the truth map, too.
     """
-    from radiotwin.links.measurements import read_measurements
-    from radiotwin.maps.survey import read_truth
-    from radiotwin.report import check_comparison_folder, write_comparison_folder
-    from radiotwin.report.comparison import compare_held_out
+    from radiotwin.report import check_comparison_folder
     from radiotwin.runtime.execution import open_executor
-    from radiotwin.runtime.pieces import keep_pieces
-    from radiotwin.scene import Scene
-    from radiotwin.twin.compare import split_flights
 
-    world = Scene.load(scene)
+    world = rt.Scene.load(scene)
     keep_scene_apart(out, world)
     check_comparison_folder(out)
-    data = in_frame_of(world, read_measurements(measurements, devices), shift)
-    split_flights(data, held_out)  # refuses before a map is read
-    truth_map = read_truth(world, truth) if truth else None
-    with keep_pieces() as pieces, open_executor(workers, cluster, notice) as executor:
-        comparison = compare_held_out(data, world, truth_map, held_out=held_out, paths=paths,
-                                      also=also or [], seed=seed, executor=executor)
+    data = in_frame_of(world, rt.read_measurements(measurements, devices), shift)
+    rt.split_flights(data, held_out)  # refuses before a map is read
+    truth_map = rt.read_truth(world, truth) if truth else None
+    with rt.keep_pieces() as pieces, open_executor(workers, cluster, notice) as executor:
+        comparison = rt.compare_held_out(data, world, truth_map, held_out=held_out, paths=paths,
+                                         also=also or [], seed=seed, executor=executor)
     notice(pieces.progress)
-    write_comparison_folder(comparison, world, out, truth_map)
+    rt.write_comparison_folder(comparison, world, out, truth_map)
     print_comparison(comparison)
     say(f"wrote {out}")
 
 
-def print_comparison(comparison: "Comparison") -> None:
+def print_comparison(comparison: "rt.Comparison") -> None:
     """Print the tables of a comparison of models."""
     result("scores", comparison.scores.to_dict("records"))
     result("locations", comparison.locations.to_dict("records"))
@@ -241,26 +232,14 @@ def close_loop(
 
     They are added to the model, and its error on held-out links before and after is reported.
     """
-    from radiotwin.closeloop.output.corrected_scene import (
-        check_corrected_target,
-        write_corrected_scene,
-    )
+    from radiotwin.closeloop.output.corrected_scene import check_corrected_target
     from radiotwin.closeloop.run import BASE_FITTED, expected_cpu_s
-    from radiotwin.closeloop.run import close_loop as run
-    from radiotwin.links.measurements import read_measurements
-    from radiotwin.report import (
-        check_closeloop_folder,
-        closeloop_summary,
-        write_closeloop_folder,
-    )
-    from radiotwin.runtime.console import progress
+    from radiotwin.report import check_closeloop_folder, closeloop_summary
     from radiotwin.runtime.execution import AUTO, open_executor
-    from radiotwin.runtime.pieces import keep_pieces
-    from radiotwin.scene import Scene
     from radiotwin.twin.locate import NOT_BY_PATHS
 
-    data = read_measurements(measurements, devices)
-    world = Scene.load(scene) if scene else None
+    data = rt.read_measurements(measurements, devices)
+    world = rt.Scene.load(scene) if scene else None
     data = in_frame_of(world, data, shift)
     keep_scene_apart(out, world)
     check_closeloop_folder(out)
@@ -274,17 +253,17 @@ def close_loop(
     inputs = {"measurements": str(measurements), "scene": scene and str(scene)}
     # Two workers are no faster than the threads of one process: only on request.
     wanted = "1" if workers == AUTO and cluster is None else workers
-    with keep_pieces() as pieces, open_executor(wanted, cluster, notice) as executor, \
+    with rt.keep_pieces() as pieces, open_executor(wanted, cluster, notice) as executor, \
             progress("closing the loop", total=None, lines=True) as advance:
         def show(text: str) -> None:
             if text == BASE_FITTED:
                 notice(expected)
             advance(1, "; ".join(filter(None, [text, pieces.progress])))
 
-        loop = run(data, world, base, seed, show, hold_out, executor=executor)
+        loop = rt.close_loop(data, world, base, seed, show, hold_out, executor=executor)
         advance(1, "other models, and the combination of all")
-        report = write_closeloop_folder(loop, world, out, inputs=inputs,
-                                        title=f"Close-loop report of {measurements.name}")
+        report = rt.write_closeloop_folder(loop, world, out, inputs=inputs,
+                                           title=f"Close-loop report of {measurements.name}")
     notice(pieces.progress)
     _print(report)
     if base == "auto" and loop.base == "raytrace":
@@ -292,7 +271,7 @@ def close_loop(
     say(closeloop_summary(report))
     say(f"wrote {out / 'closeloop.html'}")
     if write_scene is not None and world is not None:
-        changes = write_corrected_scene(loop, world, write_scene)
+        changes = rt.write_corrected_scene(loop, world, write_scene)
         say(f"wrote {write_scene}: {'; '.join(changes)}" if changes else
             f"{write_scene} is not written: no building, roof, anchor or antenna was found to "
             f"be wrong in {scene}")
@@ -335,18 +314,14 @@ def _print(report: dict[str, Any]) -> None:
 
 
 def _estimate(estimate: dict[str, Any]) -> list[float | str]:
-    """Return value and 90 % interval of a parameter; a word and two NaN if it has no estimate.
-
-    The word is "reference" for a fixed offset of 0 dB, else "not determined" (by the data).
-    """
+    """Return value and 90 % interval of a parameter; a word and two NaN if it has no estimate."""
     from radiotwin.report.closeloop_words import is_reference
 
-    if is_reference(estimate):
+    if is_reference(estimate):  # an offset that is fixed at 0 dB
         return ["reference", float("nan"), float("nan")]
-    value, low, high = (_number(estimate[key]) for key in ("value", "low", "high"))
     if not estimate.get("determined", True):
         return ["not determined", float("nan"), float("nan")]
-    return [value, low, high]
+    return [_number(estimate[key]) for key in ("value", "low", "high")]
 
 
 def _number(value: float | None) -> float:
@@ -372,31 +347,26 @@ def locate(
     It works with or without a 3D map.
     """
     from radiotwin.io.cells import write_csv
-    from radiotwin.io.files import atomic_path, require_suffix, require_writable
-    from radiotwin.io.inputs import keep_inputs, keep_others
-    from radiotwin.links.measurements import read_measurements
-    from radiotwin.scene import Scene
-    from radiotwin.twin import Twin
     from radiotwin.twin.localize.without_map import MIN_LINKS
-    from radiotwin.twin.locate import locate_devices, position_errors, read_truth
+    from radiotwin.twin.locate import read_truth
 
     require_suffix(out, ".csv", ".csv.gz")
     keep_inputs(out, measurements, devices or measurements.parent / "devices.csv", truth)
     keep_others(out, force, "device", "x_m", "y_m", "radius_m")
-    known, world = Twin.load(twin), Scene.load(scene) if scene else None
+    known, world = rt.Twin.load(twin), rt.Scene.load(scene) if scene else None
     keep_inputs(out, *(world.files if world else []))
     known.require_map(world)  # before a file is read that may be large
-    data = in_frame_of(world, read_measurements(measurements, devices), shift)
+    data = in_frame_of(world, rt.read_measurements(measurements, devices), shift)
     true = read_truth(truth, known.origin or data.origin) if truth else None
     require_writable(out)
     unknown = int((data.devices["role"] == "unknown").sum())
-    positions, notes = locate_devices(data, known, world)
+    positions, notes = rt.locate_devices(data, known, world)
     for note in notes:
         say(f"note: {note}")
     with atomic_path(out) as temporary:
         write_csv(positions, temporary)
     if true is not None:
-        error = position_errors(positions, true)
+        error = rt.position_errors(positions, true)
         print_rows("How far off [m]", {"devices": "right", "median": "right", "90 %": "right",
                                        "within the 90 % radius": "right"},
                    [[error["devices"], error["median_m"], error["ninety_m"],

@@ -8,15 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+import radiotwin as rt
 from radiotwin.errors import BadInput
 from radiotwin.io.inputs import is_within
 
 if TYPE_CHECKING:
     from radiotwin.io.forms import Origin
-    from radiotwin.links.measurements import Measurements
-    from radiotwin.maps.radiomap import RadioMap
-    from radiotwin.scene import Scene
-    from radiotwin.twin import Twin
 
 MeasurementFile = Annotated[Path, typer.Argument(
     metavar="MEASUREMENTS", help="measurements.csv, .csv.gz or .parquet, with devices.csv in the "
@@ -67,20 +64,18 @@ Cluster = Annotated[str | None, typer.Option(
 
 
 @contextmanager
-def open_model(path: Path) -> "Iterator[RadioMap | Twin]":
+def open_model(path: Path) -> "Iterator[rt.RadioMap | rt.Twin]":
     """Open a radio map (.nc, .zarr) without reading its values, or load a twin from its folder.
 
     Raises:
         BadInput: it is neither.
     """
     from radiotwin.maps.file import is_map
-    from radiotwin.maps.radiomap import RadioMap
-    from radiotwin.twin import Twin
 
     if not is_map(path):
-        yield Twin.load(path)
+        yield rt.Twin.load(path)
         return
-    with RadioMap.open(path) as radio_map:
+    with rt.RadioMap.open(path) as radio_map:
         yield radio_map
 
 
@@ -106,8 +101,8 @@ def parse_origin(text: str | None) -> "Origin | None":
         raise BadInput(f"--{error}") from None
 
 
-def in_frame_of(scene: "Scene | None", measurements: "Measurements",
-                shift: str | None) -> "Measurements":
+def in_frame_of(scene: "rt.Scene | None", measurements: "rt.Measurements",
+                shift: str | None) -> "rt.Measurements":
     """Convert measurements to a scene's local frame, plus a shift of `DX,DY` [m] if one is given.
 
     Without a scene they keep their frame.
@@ -115,21 +110,19 @@ def in_frame_of(scene: "Scene | None", measurements: "Measurements",
     Raises:
         BadInput: not two numbers, a shift without a scene, or frames that cannot be related.
     """
-    from radiotwin.links.alignment import in_scene_frame
-
     shift_m = None
     if shift is not None:
         dx_m, dy_m = parse_numbers("--shift", shift, 2, "DX,DY in metres, such as 12,-40")
         shift_m = dx_m, dy_m
     if scene is not None:
-        return in_scene_frame(measurements, scene, shift_m)
+        return rt.in_scene_frame(measurements, scene, shift_m)
     if shift_m is not None:
         raise BadInput("--shift moves measurements into the frame of a scene, and none is given; "
                        "add --scene, or leave it out")
     return measurements.on_ground(None)
 
 
-def keep_scene_apart(out: Path, scene: "Scene | None") -> None:
+def keep_scene_apart(out: Path, scene: "rt.Scene | None") -> None:
     """Raise BadInput if results would be written to the scene's own folder."""
     if scene is not None and is_within(scene.folder, out) and is_within(out, scene.folder):
         raise BadInput(f"cannot write {out}: it is the scene's folder; choose another output "

@@ -5,7 +5,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+import radiotwin as rt
 from radiotwin.cli.options import MAX_SEED, SceneOption, parse_numbers
+from radiotwin.io.files import atomic_folder, require_folder
+from radiotwin.io.inputs import keep_inputs
 from radiotwin.runtime.console import print_rows, progress, result, say
 
 if TYPE_CHECKING:
@@ -60,13 +63,9 @@ def plan(
     from marl.plan_flights import PlanSettings, plan_flights
     from marl.plan_output import FILES, write_plan
     from radiotwin.coverage.areas import read_areas
-    from radiotwin.io.files import atomic_folder, require_folder
-    from radiotwin.io.inputs import keep_inputs
-    from radiotwin.scene import Scene
-    from radiotwin.twin import Twin
 
     require_folder(out, FILES, mark="plan.json")
-    world, model = Scene.load(scene), Twin.load(twin)
+    world, model = rt.Scene.load(scene), rt.Twin.load(twin)
     keep_inputs(out, data, no_fly, world.folder, twin)
     at = None if base is None else parse_numbers("--base", base, 2)
     settings = PlanSettings(
@@ -86,10 +85,7 @@ def plan(
 
 
 def _show(planned: "PlannedFlights", wanted: float, confidence: float) -> None:
-    """Print the share of data that the plan collects, in all and by device, and fleet sizes tried.
-
-    `wanted` is the share to collect in at least the share `confidence` of the simulated worlds.
-    """
+    """Print the share of data that is collected, in all and by device, and fleet sizes tried."""
     from marl.promise import smallest
     from radiotwin.display import count
 

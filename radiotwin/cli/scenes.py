@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+import radiotwin as rt
 from radiotwin.cli.options import (
     MAX_SEED,
     Cluster,
@@ -29,15 +30,12 @@ from radiotwin.cli.options import (
     split_names,
 )
 from radiotwin.errors import BadInput
+from radiotwin.io.inputs import keep_inputs, keep_others
 from radiotwin.runtime.console import console, notice, print_rows, result, say
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from radiotwin.scene import Scene
-    from radiotwin.trace import SolverSettings
-
-Bounds = tuple[float, float, float, float]
 SAME_HEIGHT_M = 5.0  # receivers' heights within this span get one altitude of the lattice
 MAX_BUSY = 1.3  # ratio to the time of an idle machine from which on a plan reports it as busy
 
@@ -118,21 +116,18 @@ def build_scene(
     A report lists its contents and all problems that were found.
     """
     from radiotwin.scene.build import print_report
-    from radiotwin.scene.readers import build_scene as build
 
     heights_m = None if altitudes is None else parse_numbers("--altitudes", altitudes)
     if measurements is not None:
         measured_hz, measured_m = _measured(measurements, terrain is not None)
         frequency_hz, heights_m = frequency_hz or measured_hz, heights_m or measured_m
-    report = build(source, out, frequency_hz=frequency_hz, materials=_pairs(material or []),
-                   bbox=_bounds(bbox), devices=devices, uavs=uavs, seed=seed,
-                   origin=parse_origin(origin), scale=scale, up=up,
-                   default_height_m=height_default, height_column=height_column,
-                   ground_column=ground_column, material_table=material_table,
-                   terrain=terrain, terrain_unit=terrain_unit, crs=crs, layers=layer or (),
-                   overpass=overpass, step_m=step,
-                   altitudes_m=heights_m,
-                   extent_m=parse_extent(extent), check_only=check)
+    report = rt.build_scene(
+        source, out, frequency_hz=frequency_hz, materials=_pairs(material or []),
+        bbox=_bounds(bbox), devices=devices, uavs=uavs, seed=seed, origin=parse_origin(origin),
+        scale=scale, up=up, default_height_m=height_default, height_column=height_column,
+        ground_column=ground_column, material_table=material_table, terrain=terrain,
+        terrain_unit=terrain_unit, crs=crs, layers=layer or (), overpass=overpass, step_m=step,
+        altitudes_m=heights_m, extent_m=parse_extent(extent), check_only=check)
     if overpass:
         say(f"wrote {source} (© OpenStreetMap contributors, ODbL)")
     print_report(report, console)
@@ -146,15 +141,11 @@ def build_scene(
 def _measured(path: Path, on_terrain: bool) -> tuple[float | None, list[float] | None]:
     """Return the devices' median frequency [Hz], and altitudes for the lattice [m] as measured.
 
-    Altitudes are the 10, 50 and 90 % quantiles of the receivers' heights, or their median if the
-    three are within `SAME_HEIGHT_M`. None where unknown, with a note; so are heights above the
-    datum if the scene has terrain (`on_terrain`).
+    None where unknown, with a note; so are heights above the datum if the scene has terrain.
     """
     import numpy as np
 
-    from radiotwin.links.measurements import read_measurements
-
-    data = read_measurements(path)
+    data = rt.read_measurements(path)
     frequency_hz = None
     if "frequency_hz" in data.devices and data.devices["frequency_hz"].notna().any():
         frequency_hz = float(data.devices["frequency_hz"].median())
@@ -180,14 +171,10 @@ def export_scene(
     force: Force = False,
 ) -> None:
     """Write a scene's city in a format of other programs."""
-    from radiotwin.io.inputs import keep_others
-    from radiotwin.scene import Scene
-    from radiotwin.scene.export import export_scene as export
-
-    scene = Scene.load(folder)
+    scene = rt.Scene.load(folder)
     for written in (out, *[out.with_suffix(".mtl")] * (out.suffix.lower() == ".obj")):
         keep_others(written, force)
-    export(scene, out)
+    rt.export_scene(scene, out)
     say(f"wrote {out}" + (f": {', '.join(_content(out))}" if out.is_dir() else ""))
 
 
@@ -206,20 +193,15 @@ def export(
 
     One loss for each pair: nothing moves.
     """
-    from radiotwin.io.inputs import keep_inputs, keep_others
-    from radiotwin.scene import Scene
-    from radiotwin.trace import read_points
-    from radiotwin.twin.point_gains import export_ns3
-
     if to != "ns3":
         raise BadInput(f"--to {to!r} is unknown; allowed is ns3")
-    world = Scene.load(scene)
+    world = rt.Scene.load(scene)
     for name, mark in (("nodes.csv", "node"), ("losses.csv", "loss_db")):
         keep_inputs(out / name, points, *world.files)
         keep_others(out / name, force, mark)
-    ends_m = read_points(points, world.config.origin, world.city)
+    ends_m = rt.read_points(points, world.config.origin, world.city)
     with open_model(source) as model:
-        pairs = export_ns3(model, world, ends_m, out, devices=split_names(devices))
+        pairs = rt.export_ns3(model, world, ends_m, out, devices=split_names(devices))
     say(f"wrote {out / 'nodes.csv'}, {out / 'losses.csv'}: {pairs:,} pairs of a device and a point")
 
 
@@ -240,7 +222,7 @@ def _pairs(texts: list[str]) -> dict[str, str]:
     return pairs
 
 
-def _bounds(text: str | None) -> Bounds | None:
+def _bounds(text: str | None) -> tuple[float, float, float, float] | None:
     """Parse the four numbers of --bbox; None for None."""
     if text is None:
         return None
@@ -275,14 +257,12 @@ def trace(
 
     A killed run is resumed, a finished one is reused.
     """
-    from radiotwin.io.inputs import keep_inputs, keep_others
     from radiotwin.runtime.cuda import tracing_device
     from radiotwin.runtime.execution import open_executor, worker_count
-    from radiotwin.scene import Scene
-    from radiotwin.trace import trace_map, truth_path
+    from radiotwin.trace import truth_path
 
     used = tracing_device(device)
-    scene, names = Scene.load(folder), split_names(devices)
+    scene, names = rt.Scene.load(folder), split_names(devices)
     out = out or truth_path(scene, names)
     keep_inputs(out, *scene.files)
     keep_others(out, force)
@@ -294,7 +274,7 @@ def trace(
         _print_plan(scene, settings, names)
         return
     with open_executor(workers, cluster, notice) as executor:
-        facts = trace_map(scene, settings, out, names, executor).dataset.attrs
+        facts = rt.trace_map(scene, settings, out, names, executor).dataset.attrs
     say(f"wrote {out}: {facts['links']} links, {facts['links_detected']} detected, "
         f"{facts['links_below_sensitivity']} below sensitivity, {facts['links_without_path']} "
         f"without a path, {facts['links_inside_building']} inside buildings"
@@ -308,7 +288,8 @@ def trace(
             f"{100 * facts['exchanged_nlos_doubtful_share']:.0f} % differ by more than 6 dB")
 
 
-def _print_plan(scene: "Scene", settings: "SolverSettings", devices: list[str] | None) -> None:
+def _print_plan(scene: "rt.Scene", settings: "rt.SolverSettings",
+                devices: list[str] | None) -> None:
     """Print how much remains to be traced: batches, memory, and time by the number of workers."""
     from radiotwin.trace.plan import plan_trace
 
@@ -350,22 +331,18 @@ def gains(
 
     An empty gain has a reason, such as no path.
     """
-    from radiotwin.io.inputs import keep_inputs, keep_others
     from radiotwin.runtime.cuda import tracing_device
     from radiotwin.runtime.execution import open_executor
-    from radiotwin.runtime.pieces import keep_pieces
-    from radiotwin.scene import Scene
-    from radiotwin.trace import read_points, trace_points
 
     used = tracing_device(device)
-    scene, names = Scene.load(folder), split_names(devices)
+    scene, names = rt.Scene.load(folder), split_names(devices)
     keep_inputs(out, points, *scene.files)
     keep_others(out, force, "device", "gain_db", "reason")
-    points_m = read_points(points, scene.config.origin, scene.city)
+    points_m = rt.read_points(points, scene.config.origin, scene.city)
     settings = _settings(scene, points_m, names, quality, target_db, combining=combining,
                          diffraction=diffraction, seed=seed, radius_m=radius, compute_device=used)
-    with keep_pieces() as pieces, open_executor(workers, cluster, notice) as executor:
-        table = trace_points(scene, points_m, settings, out, names, executor)
+    with rt.keep_pieces() as pieces, open_executor(workers, cluster, notice) as executor:
+        table = rt.trace_points(scene, points_m, settings, out, names, executor)
     notice(pieces.progress)
     reasons = table.loc[table["reason"] != "", "reason"].value_counts()
     say(f"wrote {out}: {len(table)} links, {len(table) - reasons.sum()} with a gain"
@@ -389,19 +366,13 @@ def paths(
 
     Each link gets its delay spread, K factor and angular spreads. No ray tracer is needed.
     """
-    from radiotwin.io.inputs import keep_inputs, keep_others
-    from radiotwin.propagation.paths.listing import list_paths
-    from radiotwin.scene import Scene
-    from radiotwin.trace import read_points
-
-    scene = Scene.load(folder)
+    scene = rt.Scene.load(folder)
     keep_inputs(out, points, *scene.files)
     keep_others(out, force)
-    points_m = read_points(points, scene.config.origin, scene.city)
-    found = list_paths(scene, points_m, out, split_names(devices),
-                       None if velocity is None else parse_numbers(
-                           "--velocity", velocity, 3, "VX,VY,VZ [m/s], such as 10,0,0 for "
-                           "eastwards"), bandwidth_hz)
+    points_m = rt.read_points(points, scene.config.origin, scene.city)
+    velocity_m_s = None if velocity is None else parse_numbers(
+        "--velocity", velocity, 3, "VX,VY,VZ [m/s], such as 10,0,0 for eastwards")
+    found = rt.list_paths(scene, points_m, out, split_names(devices), velocity_m_s, bandwidth_hz)
     reasons = found["reason"].to_series().value_counts()
     if scene.city.terrain is not None:
         say("the ground is a terrain: paths reflect off its triangles and diffract where it folds "
@@ -412,25 +383,21 @@ def paths(
         + ("; gains include the antennas of scene.toml" if scene.has_antennas else ""))
 
 
-def _settings(scene: "Scene", points_m: "np.ndarray", devices: list[str] | None,
+def _settings(scene: "rt.Scene", points_m: "np.ndarray", devices: list[str] | None,
               quality: str | None, target_db: float | None, **others: str | int | float | None
-              ) -> "SolverSettings":
-    """Return solver settings of a quality, or of the cheapest quality that reaches a target [dB].
+              ) -> "rt.SolverSettings":
+    """Return solver settings of a quality, or of the cheapest that reaches a target [dB].
 
-    The target is for the RMS numerical error of gains; error and time of each quality that was
-    tried are printed. `others` are further fields of `SolverSettings`.
+    Error and time of each quality that was tried are printed.
     """
-    from radiotwin.runtime.pieces import keep_pieces
-    from radiotwin.trace import SolverSettings, choose_quality
-
     if others["diffraction"] is None:
         del others["diffraction"]
     if target_db is None:
-        return SolverSettings.of_quality(quality or "default", **others)
+        return rt.SolverSettings.of_quality(quality or "default", **others)
     if quality is not None:
         raise BadInput("--quality and --target-db both say how many rays there are; give one")
-    with keep_pieces():
-        tried = choose_quality(scene, points_m, target_db, devices, **others)
+    with rt.keep_pieces():
+        tried = rt.choose_quality(scene, points_m, target_db, devices, **others)
     links = len(points_m) * len(devices or scene.config.devices)
     print_rows(f"numerical error against ten times the rays, {tried[-1].links} links",
                {"quality": "left", "RMS [dB]": "right", "9 of 10 within [dB]": "right",
@@ -463,16 +430,12 @@ def survey(
 
     Their measurements are written, with a table of the devices.
     """
-    from radiotwin.io.inputs import keep_inputs, keep_others
-    from radiotwin.maps.survey import fly_survey, read_truth
-    from radiotwin.scene import Scene
-
-    scene = Scene.load(folder)
+    scene = rt.Scene.load(folder)
     for written in (out, out.parent / "devices.csv"):
         keep_inputs(written, *scene.files)
     keep_others(out, force, "flight", "receiver", "receiver_x_m", "device", "gain_db")
-    measurements = fly_survey(scene, read_truth(scene, truth), flights=flights, pattern=pattern,
-                              seed=seed, noise_db=noise_db)
+    measurements = rt.fly_survey(scene, rt.read_truth(scene, truth), flights=flights,
+                                 pattern=pattern, seed=seed, noise_db=noise_db)
     measurements.save(out)
     missed = int(measurements.table["gain_db"].isna().sum())
     say(f"wrote {out}: {len(measurements.flights)} flights, {len(measurements.table)} links to "

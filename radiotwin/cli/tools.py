@@ -6,7 +6,11 @@ from typing import Annotated
 
 import typer
 
+import radiotwin as rt
+from radiotwin.cli.model import print_comparison
 from radiotwin.cli.options import MAX_SEED, ComputeDevice, Force
+from radiotwin.io.files import require_suffix, require_writable
+from radiotwin.io.inputs import keep_others
 from radiotwin.runtime.console import console, notice, print_rows, result, say
 
 
@@ -23,14 +27,11 @@ def demo(
 
     The steps are build, trace, survey, fit and compare; an HTML page shows the result.
     """
-    from radiotwin.cli.demo import run_demo
-    from radiotwin.cli.model import print_comparison
     from radiotwin.runtime.cuda import tracing_device
-    from radiotwin.runtime.pieces import keep_pieces
 
     used = tracing_device(device)
-    with keep_pieces() as pieces:
-        comparison = run_demo(scene, out, seed=seed, device=used, on_progress=say)
+    with rt.keep_pieces() as pieces:
+        comparison = rt.run_demo(scene, out, seed=seed, device=used, on_progress=say)
     notice(pieces.progress)
     print_comparison(comparison)
     say(f"look at {out / 'report.html'}")
@@ -41,10 +42,10 @@ def doctor() -> None:
 
     Each problem comes with its remedy.
     """
-    from radiotwin.cli.doctor import diagnose, print_diagnosis
+    from radiotwin.cli.doctor import print_diagnosis
 
     with console.status("checking this machine"):
-        diagnosis = diagnose()
+        diagnosis = rt.diagnose()
     print_diagnosis(diagnosis, console)
     result("doctor", {"healthy": diagnosis.healthy, **asdict(diagnosis)})
     if not diagnosis.healthy:
@@ -60,9 +61,7 @@ def cache(
     resumed. The environment variable RADIOTWIN_CACHE names the folder. The oldest parts are removed
     when the cache exceeds RADIOTWIN_MAX_CACHE_BYTES.
     """
-    from radiotwin.runtime.pieces import cache_content, clear_cache
-
-    content = cache_content()
+    content = rt.cache_content()
     parts = content["parts"]
     result("cache", content | {"parts": {kind: each["parts"] for kind, each in parts.items()}})
     if parts:
@@ -71,7 +70,7 @@ def cache(
     say(f"{content['folder']}: {content['bytes'] / 1e6:.1f} MB of at most "
         f"{content['limit_bytes'] / 1e6:,.0f} MB")
     if clear:
-        say(f"removed {clear_cache():,} parts")
+        say(f"removed {rt.clear_cache():,} parts")
 
 
 def report(
@@ -92,16 +91,12 @@ def report(
 
     It shows the city in 3D with maps, flights and devices, and tables, and needs no network.
     """
-    from radiotwin.io.files import require_suffix, require_writable
-    from radiotwin.io.inputs import keep_others
-    from radiotwin.report import read_run, write_report
-
     out = out or run / "report.html"
     require_suffix(out, ".html", ".htm")
     keep_others(out, force)
-    found = read_run(run, scene, truth, measurements)
+    found = rt.read_run(run, scene, truth, measurements)
     require_writable(out)
-    write_report(found, out)
+    rt.write_report(found, out)
     for note in found.notes:
         say(f"note: {note}")
     say(f"wrote {out}: {out.stat().st_size / 1e6:.1f} MB")

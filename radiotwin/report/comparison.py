@@ -38,6 +38,7 @@ from radiotwin.twin.compare import (
     published_models,
     split_flights,
 )
+from radiotwin.twin.fit import usable_models
 
 SCHEMA = "radiotwin.comparison/1"  # of compare.json
 MAX_COLUMNS = 5  # panels in a row
@@ -102,6 +103,7 @@ def compare_held_out(measurements: Measurements | pd.DataFrame | Path | str,
     """Fit all channel models to the first flights, and compare them on the last ones.
 
     Published laws that are valid at the scene's frequency are compared as well, without a fit.
+    Without torch the model `segmented_nn` is left out, with a warning.
 
     Args:
         measurements: of several flights, also as a file or a data frame.
@@ -120,7 +122,7 @@ def compare_held_out(measurements: Measurements | pd.DataFrame | Path | str,
     scene = Scene.of(scene)
     train, test = split_flights(as_measurements(measurements, scene), held_out)
     twins, maps = _judge_also([Path(path) for path in also], truth, test.flights)
-    models = (*DEFAULT_MODELS, *published_models(scene.config.radio.frequency_hz),
+    models = (*usable_models(DEFAULT_MODELS), *published_models(scene.config.radio.frequency_hz),
               *["paths"] * paths)
     return compare_models(train, test, scene, truth, seed=seed, models=models, twins=twins,
                           maps=maps, executor=executor)

@@ -107,16 +107,8 @@ def fit_twin(measurements: Measurements | pd.DataFrame | Path | str, scene: Scen
     held_out: HeldOut | None = None
     locator: type[ChannelModel] | None = None
     if compare or model == AUTO:
-        models: tuple[str, ...] = CHEAP
-        locates: type[ChannelModel] = SegmentedNN
-        try:
-            require_torch()
-        except MissingPackage:
-            models = tuple(name for name in CHEAP if name != SegmentedNN.name)
-            locates = SegmentedLogDistance
-            replacement = f", and {locates.name} locates devices in its place" * (model == AUTO)
-            warnings.warn(f"{SegmentedNN.name} is not among the models compared{replacement}: it "
-                          "needs torch (`pip install 'radiotwin[nn]'`)", stacklevel=2)
+        replacement = f", and {SegmentedLogDistance.name} locates devices in its place"
+        models = usable_models(CHEAP, replacement * (model == AUTO))
         of_anchors = np.isin(links.device, sorted(links.anchors))
         geometry, level_db, limit_db = anchors_links(links)
         if model == AUTO and len(geometry):  # even if the best model does not use the map
@@ -125,7 +117,7 @@ def fit_twin(measurements: Measurements | pd.DataFrame | Path | str, scene: Scen
                               models)
         if model == AUTO:
             channel = channel_named(UNTRIED if held_out is None else held_out.best)
-            locator = locates
+            locator = SegmentedNN if SegmentedNN.name in models else SegmentedLogDistance
     if along_paths:
         fit = fit_along_paths if channel is ImagePaths else fit_over_wrong_map
         twin = fit(links, scene, seed, start, executor)
@@ -141,6 +133,17 @@ def fit_twin(measurements: Measurements | pd.DataFrame | Path | str, scene: Scen
     if locator is not None and not measurements.is_anchor.all():
         twin.provenance[LOCATED_BY] = locator.name
     return replace(twin, scene=scene)
+
+
+def usable_models(models: tuple[str, ...], and_so: str = "") -> tuple[str, ...]:
+    """Return the models to compare; without torch not the network, with a warning that says so."""
+    try:
+        require_torch()
+    except MissingPackage:
+        warnings.warn(f"{SegmentedNN.name} is not among the models compared{and_so}: it needs "
+                      "torch (`pip install 'radiotwin[nn]'`)", stacklevel=3)
+        return tuple(name for name in models if name != SegmentedNN.name)
+    return models
 
 
 def _usable(measurements: Measurements) -> Measurements:

@@ -1,6 +1,7 @@
 """The real command line, end to end, in a city with a statistical truth (no ray tracing, no LLVM)."""
 
 import json
+import sys
 
 import numpy as np
 import pandas as pd
@@ -62,6 +63,15 @@ def test_the_comparison_has_every_model_against_both_judges(chain):
         "a twin's map, written and read again, is the twin"
     for name in ("scores.csv", "locations.csv", "predictions.csv.gz", "scatter.png", "estimates.png", "maps.png"):
         assert (chain / "comparison" / name).stat().st_size > 500
+
+
+def test_without_torch_the_others_are_compared(chain, run, monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    monkeypatch.setattr("radiotwin.report.comparison.DEFAULT_MODELS", ("log_distance", "segmented_nn"))
+    done = run("compare survey/measurements.csv.gz --scene scene -o without", cwd=chain)
+    assert done.returncode == 0 and "segmented_nn is not among the models compared" in done.stderr, done.stderr
+    models = {row["model"] for row in json.loads((chain / "without" / "compare.json").read_text())["scores"]}
+    assert "log_distance" in models and "segmented_nn" not in models
 
 
 def test_map_exports_agree(chain, run):

@@ -8,8 +8,8 @@ import pytest
 import xarray as xr
 
 from radiotwin.geo import to_geographic
-from radiotwin.maps.radiomap import RadioMap
 from radiotwin.scene import Scene
+from tests.coverage.conftest import make_twin
 
 TOWN = Path(__file__).parents[1] / "scene" / "readers" / "town.osm"
 SITES = "device,x_m,y_m,z_m,tx_power_dbm\nroof,-60,-60,40,30\nmast,60,60,40,30\n"
@@ -57,9 +57,9 @@ def test_a_law_over_a_map(run, town, tmp_path):
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"coverage.json", "coverage.csv", "coverage.nc"}
 
 
-def test_a_twin_and_the_map_that_it_makes_agree(run, town, tmp_path, twin_in):
+def test_a_twin_and_the_map_that_it_makes_agree(run, town, tmp_path):
     """A twin at street level, and its radio map on a lattice that build-scene was asked for."""
-    twin_in(tmp_path / "twin")
+    make_twin([("roof", -60.0, -50.0, 40.0)], exponent=3.0, sd_db=5.0).save(tmp_path / "twin")
     run(f"map twin --scene {town / 'scene'} -o twin.nc --altitudes 1.5", tmp_path)
     power = "--tx-power-dbm 20 --formats nc"
     first = run(f"coverage twin --scene {town / 'scene'} {power} -o of_twin --step 10 --extent=-65,-55,65,55", tmp_path)
@@ -70,73 +70,3 @@ def test_a_twin_and_the_map_that_it_makes_agree(run, town, tmp_path, twin_in):
         np.testing.assert_allclose(one["x"], other["x"])
         np.testing.assert_allclose(one["received_power_dbm"], other["received_power_dbm"], atol=1e-4)
         np.testing.assert_allclose(one["coverage_probability"], other["coverage_probability"], atol=1e-5)
-
-
-@pytest.fixture
-def twin_in():
-    from radiotwin.propagation.laws.log_distance import SegmentedLogDistance
-    from radiotwin.twin import Twin
-    from radiotwin.twin.localize import TwinDevice
-    from radiotwin.twin.model.model import FittedModel
-
-    def make(folder):
-        lines = {"lines": np.array([[-40.0, -3.5, 7.0], [-40.0, -2.1, 4.0]])}
-        channel = SegmentedLogDistance.from_state(lines, {"borrowed": None})
-        Twin(FittedModel.of_channel(channel), [TwinDevice.anchor("roof", -60.0, -50.0, 40.0)], "gain_db", None).save(folder)
-    return make
-
-
-BAD = {
-    "no power": ("scene --model p1411 --transmitters plain.csv", ["the transmit power of mast is not known",
-                                                                  "give --tx-power-dbm"]),
-    "no transmitter": ("scene", ["there is no transmitter", "--transmitters"]),
-    "no source": ("nothing", ["nothing is neither a folder nor a radio map"]),
-    "no scene": ("map.nc", ["map.nc needs the scene's 3D map; give its folder with --scene"]),
-    "two scenes": ("scene --scene scene", ["is a scene already; leave --scene out"]),
-    "law of a map": ("map.nc --scene scene --model p1411", ["--model is for a scene without measurements"]),
-    "unknown law": ("scene --transmitters sites.csv --model okumura", ["channel model 'okumura' is unknown"]),
-    "classes": ("scene --transmitters sites.csv --classes x", ["--classes 'x' is not numbers"]),
-    "rate": ("scene --transmitters sites.csv --rate 1,2", ["--rate '1,2' is not 3 numbers"]),
-    "extent": ("scene --transmitters sites.csv --extent 1,2,3", ["--extent '1,2,3' is not 4 numbers"]),
-    "load": ("scene --transmitters sites.csv --load 2", ["a load of 2 is not possible"]),
-    "formats": ("scene --transmitters sites.csv --formats shp", ["unknown format 'shp'"]),
-    "polygon": ("scene --transmitters sites.csv --polygon none.geojson", ["none.geojson does not exist"]),
-    "points": ("scene --transmitters sites.csv --polygon points.geojson", ["points.geojson holds no polygon"]),
-    "far away": ("scene --transmitters sites.csv --polygon far.geojson", ["'far': no cell's middle lies in it"]),
-    "not degrees": ("scene --transmitters sites.csv --polygon metres.geojson", ["no longitude and latitude in degrees"]),
-    "foreign files": ("scene --transmitters sites.csv -o .", ["which the new content would erase"]),
-}
-
-
-@pytest.mark.parametrize("what", BAD)
-def test_a_mistake_is_one_message_and_nothing_is_written(run, town, tmp_path, what):
-    options, parts = BAD[what]
-    (tmp_path / "scene").symlink_to(town / "scene")
-    (tmp_path / "sites.csv").write_text(SITES)
-    (tmp_path / "plain.csv").write_text("device,x_m,y_m,z_m\nmast,0,0,40\n")
-    lattice = Scene.load(town / "scene").lattice
-    RadioMap.build(["d"], lattice, np.zeros((1, lattice.positions_m.shape[0])) - 90,
-                   np.ones((1, lattice.positions_m.shape[0]))).save(tmp_path / "map.nc")
-    feature = {"type": "Feature", "properties": {"name": "far"}}
-    for name, geometry in (("points", {"type": "Point", "coordinates": [8, 47]}),
-                           ("metres", {"type": "Polygon", "coordinates": [[[5e5, 6e6], [6e5, 6e6], [6e5, 7e6], [5e5, 6e6]]]}),
-                           ("far", {"type": "Polygon", "coordinates": [[[9, 47], [9.1, 47], [9, 47.1], [9, 47]]]})):
-        (tmp_path / f"{name}.geojson").write_text(json.dumps(
-            {"type": "FeatureCollection", "features": [feature | {"geometry": geometry}]}))
-    before = sorted(path.name for path in tmp_path.iterdir())
-    result = run(f"coverage {options}", tmp_path)
-    assert result.returncode == 2 and result.stderr.count("radiotwin:") == 1 and "Traceback" not in result.stderr, result.stderr
-    for part in parts:
-        assert part in result.stderr
-    assert sorted(path.name for path in tmp_path.iterdir()) == before
-
-
-@pytest.mark.parametrize(("options", "part"), [
-    ("--altitudes 0", "altitudes of 0 m are not possible"), ("--altitudes 2,2", "an altitude is given twice"),
-    ("--altitudes a", "--altitudes 'a' is not numbers"), ("--step 0", "a step of 0 m is not possible"),
-    ("--step 0.01 --extent=-900,-900,900,900", "RADIOTWIN_MAX_POSITIONS"),
-    ("--extent 5,5,5,9", "the minimum below the maximum"), ("--extent=-1e5,0,1e5,5", "km are allowed")])
-def test_an_impossible_lattice(run, tmp_path, options, part):
-    result = run(f"build-scene {TOWN} -o scene {options}", tmp_path)
-    assert result.returncode == 2 and part in result.stderr and "Traceback" not in result.stderr, result.stderr
-    assert not list(tmp_path.iterdir())

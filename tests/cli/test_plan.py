@@ -44,17 +44,3 @@ def test_silent_devices_and_data_lower_and_change_the_promise(run, folder):
         shares.append(json.loads((folder / "plan" / "plan.json").read_text()))
     assert shares[1]["share"]["p50"] < shares[0]["share"]["p50"]
     assert shares[1]["devices"][0]["silent"] == 0.3
-
-
-@pytest.mark.parametrize(("options", "message"), [
-    ("--base 1e6,0", "not over the lattice"),
-    ("--battery 0.2", "greater than or equal to 0.5"),
-    ("--uavs 0", "greater than or equal to 1"),
-    ("--data none.csv", "none.csv"),
-    ("--no-fly none.geojson", "none.geojson"),
-    ("--clearance-m 500", "does not reach"),
-])
-def test_what_cannot_be_planned_is_refused(run, folder, options, message):
-    done = run(f"{PLAN} {options}", folder)
-    assert done.returncode == 2 and message in done.stderr
-    assert not (folder / "plan").exists()

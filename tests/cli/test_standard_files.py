@@ -33,23 +33,12 @@ def test_paths_out(run, folder):
     with xr.open_dataset(folder / "out" / "paths.nc") as listed:
         assert listed.sizes["link"] == 2 and listed["path_count"].sum() == listed.sizes["path"] > 2
         assert listed.attrs["bandwidth_hz"] == 1e7 and "doppler_hz" in listed
-    result = run("paths scene --points points.csv --velocity 5,north -o bad.nc", cwd=folder)
-    assert result.returncode == 2 and "VX,VY,VZ" in result.stderr and not (folder / "bad.nc").exists()
 
 
-@pytest.mark.parametrize("out", ["out", "city.glb", "city.gltf", "city.obj"])
-def test_scenes_out(run, folder, out):
-    result = run(f"export-scene scene -o {out}", cwd=folder)
-    assert result.returncode == 0 and f"wrote {out}" in result.stdout, result.stderr
-    assert (folder / out).exists()
-
-
-@pytest.mark.parametrize("suffix", ["nc", "csv", "npz", "tif", "kmz", "png"])
-def test_maps_out(run, folder, suffix):
-    result = run(f"map map.nc --scene scene -o part.{suffix} --devices d1 --altitudes 60", cwd=folder)
+def test_a_part_of_a_map(run, folder):
+    result = run("map map.nc --scene scene -o part.csv --devices d1 --altitudes 60", cwd=folder)
     assert result.returncode == 0, result.stderr
-    assert f"wrote part.{suffix}: 1 device, 1 altitude of 16 by 16 positions" in result.stdout
-    assert (folder / f"part.{suffix}").stat().st_size > 500
+    assert "wrote part.csv: 1 device, 1 altitude of 16 by 16 positions" in result.stdout
 
 
 def test_a_name_that_is_not_ascii(run, folder):
@@ -88,35 +77,6 @@ def test_gains_at_points(run, folder):
     gain_db = power.loc[[0, 3], "gain_db"].astype(float).to_numpy()
     assert (gain_db > free_db - 0.1).all() and (gain_db < free_db + 6).all()  # with the ground and walls
     assert (coherent["gain_db"] != power["gain_db"])[[0, 3]].all()
-
-
-BAD = {
-    "export-scene scene -o city.stl": "unknown format '.stl'", "export-scene scene -o scene": "scene holds city.xml, meshes, preview.png, scene.toml",
-    "export-scene none -o out": "none is not a folder", "map map.nc --scene scene": "give the file to write with --out",
-    "map map.nc --scene scene -o a.xls": "unknown format '.xls'",
-    "map map.nc --scene scene -o a.tif --devices d9": "device 'd9' is not in the map",
-    "map map.nc --scene scene -o a.tif --altitudes 61": "altitude 61 m is not in the map",
-    "map map.nc --scene scene -o a.tif --altitudes high": "--altitudes 'high' is not numbers",
-    "map scene/city.nc --scene scene -o a.tif": "does not exist",
-    "map map.nc --scene scene -o none/../map.nc/a.tif": "cannot write",
-    "gains scene --points none.csv": "none.csv does not exist",
-    "gains scene --points map.nc": "map.nc: unknown format; allowed are .csv",
-    "gains scene --points p.csv --sum loud": "combining = 'loud' is unknown",
-    "gains scene --points p.csv --quality best": "quality 'best' is unknown",
-    "gains scene --points p.csv --devices d9": "device 'd9' is not in",
-    "gains scene --points p.csv -o gains.xlsx": "unknown format; allowed are .csv and .csv.gz",
-}
-
-
-@pytest.mark.parametrize("arguments", BAD)
-def test_bad_requests(run, folder, arguments):
-    import re
-
-    (folder / "p.csv").write_text("x_m,y_m,z_m\n1,2,3\n")
-    before = sorted(folder.rglob("*"))
-    result = run(arguments, cwd=folder)
-    assert result.returncode == 2 and re.search(BAD[arguments], result.stderr), result.stderr
-    assert result.stderr.count("radiotwin:") == 1 and sorted(folder.rglob("*")) == before
 
 
 def test_a_map_in_parts(run, folder):

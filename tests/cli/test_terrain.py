@@ -67,16 +67,6 @@ def test_heights_above_the_ground_that_were_imported_as_altitudes(run, folder, t
     assert done.returncode == 0 and "heights above the ground: if they are, import them as height, not as altitude" in done.stderr
 
 
-def test_what_does_not_follow_the_ground_says_so(run, folder):
-    done = run("trace scene --solver map", cwd=folder)
-    assert done.returncode == 2 and "horizontal cells, and the lattice follows the ground" in done.stderr
-    done = run("build-scene sionna:munich --terrain dem.tif", cwd=folder)
-    assert done.returncode == 2 and "--terrain cannot be used with it" in done.stderr
-    done = run("build-scene a.osm --terrain none.tif -o other", cwd=folder)
-    assert done.returncode == 2 and "none.tif does not exist; give the path of a terrain raster" in done.stderr
-    assert not (folder / "other").exists()
-
-
 def test_paths_over_the_terrain_say_what_they_lack(run, folder):
     (folder / "points.csv").write_text("x_m,y_m,above_ground_m\n0,10,60\n")
     done = run("paths scene --points points.csv --devices device01 -o paths.nc", cwd=folder)

@@ -9,11 +9,15 @@ from pathlib import Path
 
 from tests.fuzz.mutations import Mutation, apply, names
 from tests.fuzz.sandbox import Outcome, prepare_case, run_watched
-from tests.fuzz.targets import TARGETS, Target, suffix_of
+from tests.fuzz.targets import TARGETS, Target
 
 CORPUS = Path(__file__).with_name("corpus.jsonl")
 # Instead of the file: links, pipes and folders where a file should be.
-KINDS = ("pipe", "folder", "link out", "link to a device", "loop", "absent", "huge")
+INSTEAD = {
+    "pipe": os.mkfifo, "folder": Path.mkdir,
+    "link out": lambda path: path.symlink_to(next(each for each in path.parents if each.name == "work").with_name("canary")),
+    "link to a device": lambda path: path.symlink_to("/dev/zero"), "loop": lambda path: path.symlink_to(path),
+    "absent": lambda path: None, "huge": lambda path: path.touch() or os.truncate(path, 2**40)}
 MUTATION_COUNT = (1, 1, 1, 2, 3, 6)
 
 
@@ -31,23 +35,22 @@ class Case:
         return json.dumps(asdict(self))
 
     @property
-    def kind(self) -> str:
-        """Class of its file, in the counts."""
-        return next((target.kind for target in TARGETS if (target.file, target.command) == (self.file, self.command)),
-                    "gone")
+    def target(self) -> Target:
+        """Its target; of a command that is gone, one of its own."""
+        return next((each for each in TARGETS if (each.file, each.command) == (self.file, self.command)),
+                    Target("gone", self.file, self.command))
 
 
 def loads(line: str) -> Case:
     """Return a case from one line of JSON."""
     record = json.loads(line)
-    mutations = tuple(Mutation(**each) for each in record.pop("mutations"))
-    return Case(**record, mutations=mutations)
+    return Case(**record | {"mutations": tuple(Mutation(**each) for each in record["mutations"])})
 
 
 def instead_of(target: Target) -> list[str]:
     """Return what may be put instead of a file; a file that the user names may be a link to any place."""
     named = target.file in target.command.split()
-    return [kind for kind in KINDS if not (named and kind == "link out")]
+    return [kind for kind in INSTEAD if not (named and kind == "link out")]
 
 
 def draw(rng: random.Random, targets: list[Target]) -> Case:
@@ -62,39 +65,20 @@ def draw(rng: random.Random, targets: list[Target]) -> Case:
 
 def listen() -> socket.socket:
     """Return a server on this machine that nothing may call."""
-    listener = socket.socket()
-    listener.bind(("127.0.0.1", 0))
-    listener.listen(8)
+    listener = socket.create_server(("127.0.0.1", 0))
     listener.setblocking(False)
     return listener
 
 
 def run_case(case: Case, honest: Path, folder: Path, listener: socket.socket) -> Outcome:
     """Damage a copy of the honest files, run the command and judge what it did."""
-    work = prepare_case(honest, folder)
-    path = work / case.file
+    path = prepare_case(honest, folder) / case.file
     if case.instead:
-        _put_instead(path, case.instead, folder)
+        path.unlink()
+        INSTEAD[case.instead](path)
     else:
         data = path.read_bytes()
         for mutation in case.mutations:
-            data = apply(mutation, data, suffix_of(path.name), listener.getsockname()[1])
+            data = apply(mutation, data, case.target.suffix, listener.getsockname()[1])
         path.write_bytes(data)
     return run_watched(case.command, folder, listener)
-
-
-def _put_instead(path: Path, kind: str, folder: Path) -> None:
-    path.unlink()
-    if kind == "pipe":
-        os.mkfifo(path)
-    elif kind == "folder":
-        path.mkdir()
-    elif kind == "link out":
-        path.symlink_to(folder / "canary")
-    elif kind == "link to a device":
-        path.symlink_to("/dev/zero")
-    elif kind == "loop":
-        path.symlink_to(path)
-    elif kind == "huge":
-        with open(path, "wb") as file:
-            file.truncate(2**40)

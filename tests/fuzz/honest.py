@@ -8,10 +8,7 @@ import os
 import re
 import runpy
 import shutil
-import signal
 import struct
-import sys
-import warnings
 import zipfile
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -21,7 +18,9 @@ from unittest import mock
 import numpy as np
 import pandas as pd
 
+from tests.command_line import run_in_this_process
 from tests.scene.readers import city_models
+from tests.worlds import fly, measured
 
 SQUARE = [[8.001, 50.001], [8.002, 50.001], [8.002, 50.002], [8.001, 50.002], [8.001, 50.001]]
 RUN = "scene --truth segmented --real-episodes 1 --episodes 8 --flights 2 --compare none --planner-iterations 50 --hidden 8"
@@ -70,7 +69,7 @@ def make_honest(folder: Path) -> None:
     """Fill a new folder."""
     (folder / "open").mkdir(parents=True)
     _write_survey(folder / "open")
-    _write_maps(folder)
+    write_maps(folder)
     _write_log(folder)
     _write_other_logs(folder)
     _write_foreign_logs(folder)
@@ -101,29 +100,19 @@ def make_honest(folder: Path) -> None:
 
 
 def _write_survey(folder: Path) -> None:
-    rng = np.random.default_rng(1)
-    device_m = rng.uniform(0, 300, (4, 2))
-    rows = []
-    for flight in range(3):
-        path_m = np.cumsum(rng.normal(0, 15, (25, 2)), axis=0) + 150
-        for slot, (x, y) in enumerate(path_m):
-            for device, (east, north) in enumerate(device_m):
-                distance_m = np.sqrt((x - east) ** 2 + (y - north) ** 2 + 50**2)
-                level_db = -38 - 22 * np.log10(distance_m) + rng.normal(0, 2) + 6 * (flight == 1)
-                rows.append((flight * 100 + slot, f"f{flight}", f"r{flight % 2}", x, y, 51.5, f"d{device}", level_db))
-    names = ["time_s", "flight", "receiver", "receiver_x_m", "receiver_y_m", "receiver_z_m", "device", "gain_db"]
-    pd.DataFrame(rows, columns=names).to_csv(folder / "measurements.csv", index=False)
-    _write_devices(folder.parent / "located.csv", device_m)
-    device_m[3] = np.nan
-    _write_devices(folder / "devices.csv", device_m)
+    """Write a survey of four devices, of which one is unknown, and a table of where they are."""
+    made = fly(1, flights=3, slots=25, devices=4)
+    made.gain_db += 6 * (made.flight == 1)
+    survey = measured(made)
+    survey.devices.to_csv(folder.parent / "located.csv", index=False)
+    survey.save(folder / "measurements.csv")
+    lost = survey.devices["device"] == "d3"
+    survey.devices.assign(role=np.where(lost, "unknown", "anchor"), x_m=survey.devices["x_m"].mask(lost),
+                          y_m=survey.devices["y_m"].mask(lost)).to_csv(folder / "devices.csv", index=False)
 
 
-def _write_devices(path: Path, device_m: np.ndarray) -> None:
-    pd.DataFrame({"device": [f"d{i}" for i in range(4)], "x_m": device_m[:, 0], "y_m": device_m[:, 1], "z_m": 1.5,
-                  "role": ["anchor"] * 3 + ["unknown"]}).to_csv(path, index=False)
-
-
-def _write_maps(folder: Path) -> None:
+def write_maps(folder: Path) -> None:
+    """Write a small city in every format that `build-scene` reads."""
     shape = {"type": "Polygon", "coordinates": [SQUARE]}
     feature = {"type": "Feature", "properties": {"building": "yes", "height": "12"}, "geometry": shape}
     (folder / "town.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
@@ -155,7 +144,7 @@ def _write_maps(folder: Path) -> None:
     import trimesh
 
     box = trimesh.creation.box(bounds=[[0, 0, 0], [20, 30, 10]])
-    for suffix in ("glb", "gltf", "stl"):
+    for suffix in ("glb", "gltf", "stl", "ply"):
         data = box.export(file_type=suffix)
         for name, content in (data if suffix == "gltf" else {f"box.{suffix}": data}).items():
             (folder / name.replace("model", "box")).write_bytes(content)
@@ -317,23 +306,9 @@ def one_core() -> contextlib.AbstractContextManager:
 def run_here(line: str, folder: Path) -> None:
     """Run a command in this process, which then has imported all that its forked children need."""
     module, *arguments = line.split()
-    argv, before, show = sys.argv, Path.cwd(), warnings.showwarning
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    said, status = io.StringIO(), 0
-    try:
-        sys.argv = [module, *arguments]
-        os.chdir(folder)
-        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said), warnings.catch_warnings():
-            run_command(module)
-    except SystemExit as end:
-        status = end.code or 0
-    finally:
-        os.chdir(before)
-        sys.argv, warnings.showwarning = argv, show
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-    if status:
-        raise RuntimeError(f"{line}: exit status {status}\n{said.getvalue()}")
+    done = run_in_this_process(lambda: run_command(module), arguments, folder)
+    if done.returncode:
+        raise RuntimeError(f"{line}: exit status {done.returncode}\n{done.stdout}{done.stderr}")
 
 
 def _gains_of_nothing(scene: object, device_m: np.ndarray, points_m: np.ndarray, *others: object) -> np.ndarray:

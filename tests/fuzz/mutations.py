@@ -67,64 +67,29 @@ def _text(what: int) -> str:
     return TEXTS[what % len(TEXTS)]
 
 
-# Of any file ----------------------------------------------------------------------------------------------------------
-
-def _flip(data: bytes, where: float, what: int) -> bytes:
+def _spliced(data: bytes, where: float, removed: int, added: bytes) -> bytes:
+    """Replace some bytes at a place."""
     index = _at(where, len(data))
-    return data[:index] + bytes([data[index] ^ (1 << what % 8)]) + data[index + 1:]
+    return data[:index] + added + data[index + removed:]
 
 
-def _byte(data: bytes, where: float, what: int) -> bytes:
-    index = _at(where, len(data))
-    return data[:index] + bytes([(0, 255, 127, 128, 10, 34)[what % 6]]) + data[index + 1:]
+Change = Callable[[bytes, float, int], bytes]
+EMPTY = (b"", b"\n", b"\x00" * 1000, b"\xff\xfe" + b"a\x00" * 20, b"[" * 50_000, b"PK\x03\x04")
+BYTES: dict[str, Change] = {
+    "flip": lambda data, where, what: _spliced(data, where, 1, bytes([data[_at(where, len(data))] ^ (1 << what % 8)])),
+    "byte": lambda data, where, what: _spliced(data, where, 1, bytes([(0, 255, 127, 128, 10, 34)[what % 6]])),
+    "cut": lambda data, where, what: data[:int(where * len(data))],
+    "drop": lambda data, where, what: _spliced(data, where, 1 + what % 64, b""),
+    "repeat": lambda data, where, what: _spliced(data, where, 0, data[_at(where, len(data)):][:1 + what % 256] * (1 + what % 500)),
+    "insert": lambda data, where, what: _spliced(data, where, 0, _text(what).encode("utf-8", "replace")),
+    "empty": lambda data, where, what: EMPTY[what % 6],
+    "zeros": lambda data, where, what: data + bytes(10 * 2**20)}
 
-
-def _cut(data: bytes, where: float, what: int) -> bytes:
-    return data[:int(where * len(data))]
-
-
-def _drop(data: bytes, where: float, what: int) -> bytes:
-    index = _at(where, len(data))
-    return data[:index] + data[index + 1 + what % 64:]
-
-
-def _repeat(data: bytes, where: float, what: int) -> bytes:
-    index = _at(where, len(data))
-    return data[:index] + data[index:index + 1 + what % 256] * (2 + what % 500) + data[index:]
-
-
-def _insert(data: bytes, where: float, what: int) -> bytes:
-    index = int(where * len(data))
-    return data[:index] + _text(what).encode("utf-8", "replace") + data[index:]
-
-
-def _empty(data: bytes, where: float, what: int) -> bytes:
-    return (b"", b"\n", b"\x00" * 1000, b"\xff\xfe" + b"a\x00" * 20, b"[" * 50_000, b"PK\x03\x04")[what % 6]
-
-
-def _zeros(data: bytes, where: float, what: int) -> bytes:
-    return data + bytes(10 * 2**20)
-
-
-BYTES: dict[str, Callable[[bytes, float, int], bytes]] = {
-    "flip": _flip, "byte": _byte, "cut": _cut, "drop": _drop, "repeat": _repeat, "insert": _insert, "empty": _empty,
-    "zeros": _zeros}
-
-
-# Of texts -------------------------------------------------------------------------------------------------------------
 
 def _replaced(pattern: re.Pattern, data: bytes, where: float, new: str) -> bytes:
     found = list(pattern.finditer(data))
     match = found[_at(where, len(found))]
     return data[:match.start()] + new.encode("utf-8", "replace") + data[match.end():]
-
-
-def _number_in_text(data: bytes, where: float, what: int) -> bytes:
-    return _replaced(_NUMBER, data, where, _number(what))
-
-
-def _word_in_text(data: bytes, where: float, what: int) -> bytes:
-    return _replaced(_WORD, data, where, _text(what))
 
 
 def _line_in_text(data: bytes, where: float, what: int) -> bytes:
@@ -139,7 +104,9 @@ def _line_in_text(data: bytes, where: float, what: int) -> bytes:
     return b"\n".join(lines)
 
 
-TEXT = {"number": _number_in_text, "word": _word_in_text, "line": _line_in_text}
+TEXT: dict[str, Change] = {
+    "number": lambda data, where, what: _replaced(_NUMBER, data, where, _number(what)),
+    "word": lambda data, where, what: _replaced(_WORD, data, where, _text(what)), "line": _line_in_text}
 
 
 def _json_node(data: bytes, where: float, what: int) -> bytes:
@@ -174,48 +141,6 @@ def _json_deep(data: bytes, where: float, what: int) -> bytes:
     return (text[:index] + "[" * depth + "]" * depth + text[index:].lstrip("0123456789.-e")).encode()
 
 
-def _surface(data: bytes, where: float, what: int) -> bytes:
-    """Change a surface of a city model: leave it out, repeat it, turn it, give it another corner, or put all in one place."""
-    model = json.loads(data)
-    geometry = [each for known in model["CityObjects"].values() for each in known["geometry"]][-1]
-    geometry.pop("semantics", None)
-    shell = geometry["boundaries"][0]
-    index, count = _at(where, len(shell)), len(model["vertices"])
-    ring = shell[index][0]
-    if what % 8 == 0:
-        del shell[index]
-    elif what % 8 == 1:
-        shell += [shell[index]] * (1, 10, 3000)[what // 8 % 3]
-    elif what % 8 == 2:
-        ring.reverse()
-    elif what % 8 == 3:
-        ring[what // 8 % len(ring)] = what // 64 % count
-    elif what % 8 == 4:
-        ring.insert(what // 8 % len(ring), what // 64 % count)
-    elif what % 8 == 5:
-        shell[index].append([number * what % count for number in range(3 + what // 8 % 5)])
-    elif what % 8 == 6:
-        model["vertices"][what // 8 % count] = model["vertices"][what // 64 % count]
-    else:
-        name, known = list(model["CityObjects"].items())[-1]
-        model["CityObjects"] |= {f"{name}-{number}": known for number in range((10, 200, 5000)[what // 8 % 3])}
-    return json.dumps(model).encode()
-
-
-def _geometry(what: int) -> bytes:
-    """Return well-known binary that libraries do not expect: without end, cut off, not finite, curved."""
-    ring = np.array([[8, 47], [8.0002, 47], [8.0002, 47.0002], [8, 47]])
-    head = [b"\1" + kind.to_bytes(4, "little") for kind in (1, 3, 6, 7, 8, 10, 12, 15, 17, 99, 1007, 2**31 + 7)]
-    one = b"\1\0\0\0"
-    polygon = head[1] + one + len(ring).to_bytes(4, "little") + ring.tobytes()
-    kind = head[what // 7 % len(head)]
-    return ((kind + one) * (50, 200, 50_000)[what // 97 % 3] + polygon, kind + one + polygon, polygon[:what % len(polygon)],
-            kind + b"\xff" * 4 + polygon, polygon.replace(ring[1].tobytes(), np.array([np.nan, np.inf]).tobytes()),
-            kind + bytes(4), kind + one + head[4] + one + polygon)[what % 7]
-
-
-# Of a command line, with NUL between its arguments -------------------------------------------------------------------
-
 def _value_of_option(data: bytes, where: float, what: int) -> bytes:
     """Change the value of an option, or a part of it; never where outputs go, nor what the command is."""
     arguments = data.split(b"\0")
@@ -239,8 +164,6 @@ def _value_of_option(data: bytes, where: float, what: int) -> bytes:
     return b"\0".join(arguments)
 
 
-# Of containers --------------------------------------------------------------------------------------------------------
-
 def _inside(data: bytes, where: float, what: int) -> bytes:
     """Change what is compressed."""
     inner = gzip.decompress(data)
@@ -259,7 +182,7 @@ def _header(data: bytes, where: float, what: int) -> bytes:
     header = data[8:8 + length]
     if what % 5 == 0:
         return (2**(20 + what % 40)).to_bytes(8, "little") + data[8:]
-    changed = _json_node(header, where, what) if what % 2 else _number_in_text(header, where, what)
+    changed = _json_node(header, where, what) if what % 2 else TEXT["number"](header, where, what)
     return len(changed).to_bytes(8, "little") + changed + data[8 + length:]
 
 
@@ -326,11 +249,9 @@ def _sqlite(data: bytes, where: float, what: int) -> bytes:
             table = tables[_at(where, len(tables))]
             columns = [row[1] for row in database.execute(f"PRAGMA table_info({table})")]
             column = columns[what % len(columns)]
-            database.create_function("geometry", 0, lambda: b"GP\0\1" + (4326).to_bytes(4, "little") + _geometry(what))
             for trigger in database.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'").fetchall():
                 database.execute(f"DROP TRIGGER {trigger[0]}")
             statements = (
-                f"UPDATE {table} SET geom = geometry()" if "geom" in columns else f"DELETE FROM {table}",
                 f"UPDATE sqlite_master SET sql = CAST(replace(CAST(sql AS BLOB), '{column}', x'ff' || '{column}') AS TEXT)",
                 f"UPDATE {table} SET {column} = NULL", f"UPDATE {table} SET {column} = '{_number(what)}'",
                 f"UPDATE {table} SET {column} = zeroblob({10 ** (what % 7)})", f"DROP TABLE {table}",
@@ -356,7 +277,6 @@ def _parquet(data: bytes, where: float, what: int) -> bytes:
         pa.array([[1.0]] * count), pa.array([{"a": 1}] * count), pa.array([True] * count), pa.array([10**18] * count),
         pa.array(["a"] * count).dictionary_encode(), pa.array([0] * count, pa.timestamp("us")),
         pa.array([None, *["a"] * (count - 1)]), pa.array([b"\xff", *[b"a"] * (count - 1)]),
-        pa.array([_geometry(what)] * count),
         pa.StringArray.from_buffers(count, *pa.array([b"\xff"] * count).buffers()[1:]))
     name = table.column_names[index] if what % 3 else _text(what)
     out = io.BytesIO()
@@ -367,11 +287,9 @@ def _parquet(data: bytes, where: float, what: int) -> bytes:
     return out.getvalue()
 
 
-def _of(suffix: str) -> dict[str, Callable[[bytes, float, int], bytes]]:
+def _of(suffix: str) -> dict[str, Change]:
     return {
-        ".json": TEXT | {"node": _json_node, "deep": _json_deep}, ".geojson": TEXT | {"node": _json_node, "deep": _json_deep},
-        ".city.json": TEXT | {"node": _json_node, "deep": _json_deep, "surface": _surface, "surface again": _surface},
-        ".gltf": TEXT | {"node": _json_node, "deep": _json_deep},
+        **dict.fromkeys((".json", ".geojson", ".city.json", ".gltf"), TEXT | {"node": _json_node, "deep": _json_deep}),
         ".gz": {"inside": _inside, "bomb": _bomb}, ".safetensors": {"header": _header},
         ".nc": {"object": _hdf5}, ".args": {"value": _value_of_option}, ".gpkg": {"statement": _sqlite}, ".parquet": {"column": _parquet},
     }.get(suffix, TEXT)

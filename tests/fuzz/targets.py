@@ -5,11 +5,6 @@ from dataclasses import dataclass
 from tests.fuzz.honest import LINES
 
 
-def suffix_of(file: str) -> str:
-    """Return the ending of a file's name; that of a city model in JSON has two parts."""
-    return ".city.json" if file.endswith(".city.json") else "." + file.rpartition(".")[2]
-
-
 @dataclass(frozen=True)
 class Target:
     """A file of the honest folder and a command that reads it.
@@ -24,112 +19,77 @@ class Target:
 
     @property
     def suffix(self) -> str:
-        """Ending of the file, which decides how it is damaged."""
-        return suffix_of(self.file)
+        """Ending of the file, which decides how it is damaged; that of a city model in JSON has two parts."""
+        return ".city.json" if self.file.endswith(".city.json") else "." + self.file.rpartition(".")[2]
 
 
-_SURVEY = "open/measurements.csv"
-_FIT = "radiotwin fit survey/{} --scene scene --model log_distance -o out"
-_RUN = ("marl.fedqmix --scene scene --truth segmented --real-episodes 1 --episodes 8 --flights 2 --compare none "
-        "--planner-iterations 50 --hidden 8 --out run --resume")
-_IMPORT = "radiotwin import {} --columns {} -o out"
-_MESH = "scene/meshes/building_000.ply"
-TARGETS = (
-    *(Target("scene.toml", "scene/scene.toml", command) for command in (
-        "radiotwin survey scene --truth segmented --flights 1 -o out/measurements.csv",
-        "radiotwin map twin --scene scene --altitudes 55 -o out.npz", "radiotwin export-scene scene -o out.glb",
-        "radiotwin report scene -o out.html")),
-    *(Target("city.xml", "scene/city.xml", command) for command in (
-        "radiotwin survey scene --truth segmented --flights 1 -o out/measurements.csv",
-        "radiotwin export-scene scene -o out", "radiotwin build-scene scene/city.xml --check")),
-    *(Target("mesh", _MESH, command) for command in (
-        "radiotwin survey scene --truth segmented --flights 1 -o out/measurements.csv",
-        "radiotwin export-scene scene -o out.obj")),
-    Target("foreign city", "city.xml", "radiotwin build-scene city.xml -o out"),
-    Target("OpenStreetMap", "town.osm", "radiotwin build-scene town.osm -o out"),
-    Target("GeoJSON map", "town.geojson", "radiotwin build-scene town.geojson -o out"),
-    Target("Overpass", "town.json", "radiotwin build-scene town.json -o out"),
-    Target("GeoPackage", "town.gpkg", "radiotwin build-scene town.gpkg -o out"),
-    Target("GeoParquet", "town.parquet", "radiotwin build-scene town.parquet -o out"),
-    *(Target("Shapefile", f"town.{suffix}", "radiotwin build-scene town.shp -o out") for suffix in ("shp", "dbf", "prj")),
-    Target("Shapefile", "town.zip", "radiotwin build-scene town.zip -o out"),
-    Target("city model", "town.city.json", "radiotwin build-scene town.city.json -o out"),
-    Target("city model", "town.gml", "radiotwin build-scene town.gml -o out"),
-    *(Target("model", file, f"radiotwin build-scene {file} -o out") for file in ("box.glb", "box.gltf", "box.stl", "roof.obj")),
-    Target("terrain", "dem.tif", "radiotwin build-scene town.geojson --terrain dem.tif -o out"),
-    Target("materials", "materials.toml", "radiotwin build-scene town.geojson --material-table materials.toml -o out"),
-    Target("antenna", "antennas/pattern.msi", "radiotwin report antennas -o out.html"),
-    Target("antenna", "antennas/pattern.csv", "radiotwin report antennas -o out.html"),
-    Target("measurements", "survey/measurements.csv", _FIT.format("measurements.csv")),
-    Target("measurements", "survey/devices.csv", _FIT.format("measurements.csv")),
-    Target("measurements", "survey/packed.csv.gz", _FIT.format("packed.csv.gz")),
-    Target("measurements", "survey/table.parquet", _FIT.format("table.parquet")),
-    Target("measurements", _SURVEY, f"radiotwin close-loop {_SURVEY} --base log-distance -o out", slow=True),
-    Target("measurements", _SURVEY, f"radiotwin locate {_SURVEY} --twin loop/twin -o out.csv"),
-    Target("measurements", "survey/measurements.csv", "radiotwin compare survey/measurements.csv --scene scene -o out",
-           slow=True),
-    *(Target("log to import", file, "radiotwin import log.csv --columns import.toml -o out")
-      for file in ("log.csv", "sites.csv", "import.toml")),
-    *(Target("twin", file, command) for file, command in (
-        ("twin/twin.json", "radiotwin map twin --scene scene --altitudes 55 -o out.nc"),
-        ("twin/channel.safetensors", "radiotwin map twin --scene scene --altitudes 55 -o out.csv"),
-        ("twin_nn/twin.json", "radiotwin report twin_nn --scene scene -o out.html"),
-        ("twin_nn/channel.safetensors", "radiotwin map twin_nn --scene scene --altitudes 55 -o out.tif"),
-        ("loop/twin/twin.json", f"radiotwin locate {_SURVEY} --twin loop/twin -o out.csv"),
-        ("loop/twin/twin.json", "radiotwin map loop/twin --scene scene --altitudes 55 -o out.nc"))),
-    *(Target("radio map", "map.nc", command) for command in (
-        "radiotwin map map.nc --scene scene -o out.npz", "radiotwin map map.nc --scene scene --altitudes 55 -o out.tif",
-        "radiotwin map map.nc --scene scene --devices d1 -o out.png",
-        "radiotwin report scene --truth map.nc -o out.html")),
-    *(Target("transmitters", file, "radiotwin coverage town --transmitters sites/sites.csv --step 20 --indoor-loss-db 9 --formats nc "
-             "-o out")
-      for file in ("sites/sites.csv", "sites/pattern.csv")),
-    Target("GeoJSON map", "town.geojson",
-           "radiotwin coverage town --transmitters sites/sites.csv --step 20 --polygon town.geojson --indoor-loss-db 9 "
-           "--formats gpkg -o out"),
-    Target("radio map", "map.nc", "radiotwin coverage map.nc --scene scene --tx-power-dbm 20 --formats tif,png -o out"),
-    Target("twin", "twin/twin.json", "radiotwin coverage twin --scene scene --tx-power-dbm 20 --step 30 --formats nc -o out"),
-    *(Target("run folder", file, "radiotwin report loop -o out.html")
-      for file in ("loop/closeloop.json", "loop/residuals.csv.gz", "loop/groups.png")),
-    *(Target("run folder", f"comparison/{name}", "radiotwin report comparison --scene scene -o out.html")
-      for name in ("compare.json",)),
-    Target("run folder", "run/config.json", "radiotwin report run -o out.html"),
-    Target("run folder", "run/flights.csv", "radiotwin report run -o out.html"),
-    Target("run folder", "run/comparison.csv", "radiotwin report run -o out.html"),
-    Target("scene.toml", "scene/scene.toml", "radiotwin close-loop survey/measurements.csv --scene scene --base log-distance -o out",
-           slow=True),
-    Target("scene.toml", "scene/scene.toml",
-           "marl.fedqmix --scene scene --truth segmented --twin truth --algorithm random --real-episodes 1 --flights 2 "
-           "--planner-iterations 50 --out out"),
-    Target("scene.toml", "scene/scene.toml", "radiotwin build-scene scene/city.xml -o out"),
-    Target("foreign city", "roof.obj", "radiotwin build-scene city.xml -o out"),
-    Target("foreign city", "exported/city.xml", "radiotwin build-scene exported/city.xml -o out"),
-    Target("foreign city", "exported/meshes/building_000.ply", "radiotwin build-scene exported/city.xml -o out"),
-    Target("OpenStreetMap", "town.osm.pbf", "radiotwin build-scene town.osm.pbf -o out"),
-    Target("measurements", "located.csv", f"radiotwin locate {_SURVEY} --twin loop/twin --truth located.csv -o out.csv"),
-    *(Target("log to import", file, _IMPORT.format(file, settings)) for file, settings in (
-        ("log.csv.gz", "import.toml"), ("log.parquet", "import.toml"), ("log.geojson", "points.toml"),
-        ("fixed.csv", "fixed.toml"))),
-    *(Target("log to import", file, _IMPORT.format("fixed.csv", "fixed.toml")) for file in ("masts.csv", "fixed.toml")),
-    *(Target("log to import", file, _IMPORT.format(file, "import.toml"))
-      for file in ("german.csv", "logs.zip", "log.xlsx")),
-    *(Target("log to import", file, f"radiotwin import {file} -o out") for file in ("uplinks.jsonl", "wigle.csv")),
-    Target("log to import", "scan.csv", "radiotwin import scan.csv --time-zone UTC --band-hz 1000,1600 --track flight.gpx -o out"),
-    *(Target("track", file, f"radiotwin import levels.csv --columns levels.toml --track {file} -o out")
-      for file in ("flight.gpx", "flight.nmea", "flight.ulg")),
-    Target("points", "points.csv", "radiotwin gains scene --points points.csv --quality fast -o out.csv"),
-    *(Target("twin", f"{folder}/{file}", command.format(folder), slow="raytrace" in folder)
-      for folder, command in (
-        ("twin_corrected", "radiotwin locate links/measurements.csv --twin {} -o out.csv"),
-        ("twin_raytrace", "radiotwin map {} --scene scene --altitudes 55 -o out.nc"),
-        ("twin_raytrace", "radiotwin report {} --scene scene -o out.html"),
-        ("twin_kriging", "radiotwin map {} --scene scene --altitudes 55 -o out.png"))
-      for file in ("twin.json", "channel.safetensors")),
-    Target("twin", "twin/twin.json", _FIT.format("measurements.csv --start twin")),
-    Target("radio map", "map.nc", "radiotwin compare survey/measurements.csv --scene scene --truth map.nc -o out", slow=True),
-    Target("radio map", "map.nc", "radiotwin survey scene --truth map.nc --flights 1 -o out.csv"),
-    *(Target("command line", f"args/{name}.args", f"@args/{name}.args", slow=name in ("compare", "loop"))
-      for name in LINES),
-    Target("checkpoint", "run/checkpoint.safetensors", _RUN),
-    Target("checkpoint", "run/config.json", _RUN),
+SURVEY = "survey scene --truth segmented --flights 1 -o out/measurements.csv"
+FIT = "fit survey/measurements.csv --scene scene --model log_distance -o out"
+LOCATE = "locate open/measurements.csv --twin loop/twin -o out.csv"
+COVERAGE = "coverage town --transmitters sites/sites.csv --step 20 --indoor-loss-db 9 --formats nc -o out"
+RESUME = ("marl.fedqmix --scene scene --truth segmented --real-episodes 1 --episodes 8 --flights 2 --compare none "
+          "--planner-iterations 50 --hidden 8 --out run --resume")
+SLOW = ("close-loop", "compare", "@args/compare", "@args/loop")
+# Kind, files, commands: every command reads every file of its row; {} is the file.
+TABLE = (
+    ("scene.toml", "scene/scene.toml", (
+        SURVEY, "map twin --scene scene --altitudes 55 -o out.npz", "export-scene scene -o out.glb", "report scene -o out.html",
+        "close-loop survey/measurements.csv --scene scene --base log-distance -o out", "build-scene scene/city.xml -o out",
+        "marl.fedqmix --scene scene --truth segmented --twin truth --algorithm random --real-episodes 1 --flights 2 "
+        "--planner-iterations 50 --out out")),
+    ("city.xml", "scene/city.xml", (SURVEY, "export-scene scene -o out", "build-scene scene/city.xml --check")),
+    ("mesh", "scene/meshes/building_000.ply", (SURVEY, "export-scene scene -o out.obj")),
+    ("foreign city", "city.xml roof.obj", ("build-scene city.xml -o out",)),
+    ("foreign city", "exported/city.xml exported/meshes/building_000.ply", ("build-scene exported/city.xml -o out",)),
+    ("OpenStreetMap", "town.osm town.osm.pbf", ("build-scene {} -o out",)),
+    ("GeoJSON map", "town.geojson", ("build-scene {} -o out", f"{COVERAGE.replace('nc', 'gpkg')} --polygon town.geojson")),
+    ("Overpass", "town.json", ("build-scene {} -o out",)), ("GeoPackage", "town.gpkg", ("build-scene {} -o out",)),
+    ("GeoParquet", "town.parquet", ("build-scene {} -o out",)),
+    ("Shapefile", "town.shp town.dbf town.prj", ("build-scene town.shp -o out",)), ("Shapefile", "town.zip", ("build-scene {} -o out",)),
+    ("city model", "town.city.json town.gml", ("build-scene {} -o out",)),
+    ("model", "box.glb box.gltf box.stl roof.obj", ("build-scene {} -o out",)),
+    ("terrain", "dem.tif", ("build-scene town.geojson --terrain dem.tif -o out",)),
+    ("materials", "materials.toml", ("build-scene town.geojson --material-table materials.toml -o out",)),
+    ("antenna", "antennas/pattern.msi antennas/pattern.csv", ("report antennas -o out.html",)),
+    ("measurements", "survey/measurements.csv survey/devices.csv", (FIT,)),
+    ("measurements", "survey/packed.csv.gz survey/table.parquet", (FIT.replace("survey/measurements.csv", "{}"),)),
+    ("measurements", "open/measurements.csv", ("close-loop {} --base log-distance -o out", LOCATE)),
+    ("measurements", "survey/measurements.csv", ("compare survey/measurements.csv --scene scene -o out",)),
+    ("log to import", "log.csv sites.csv import.toml", ("import log.csv --columns import.toml -o out",)),
+    ("log to import", "log.csv.gz log.parquet german.csv logs.zip log.xlsx", ("import {} --columns import.toml -o out",)),
+    ("log to import", "log.geojson", ("import {} --columns points.toml -o out",)),
+    ("log to import", "fixed.csv masts.csv fixed.toml", ("import fixed.csv --columns fixed.toml -o out",)),
+    ("log to import", "uplinks.jsonl wigle.csv", ("import {} -o out",)),
+    ("log to import", "scan.csv", ("import {} --time-zone UTC --band-hz 1000,1600 --track flight.gpx -o out",)),
+    ("track", "flight.gpx flight.nmea flight.ulg", ("import levels.csv --columns levels.toml --track {} -o out",)),
+    ("points", "points.csv", ("gains scene --points points.csv --quality fast -o out.csv",)),
+    ("twin", "twin/twin.json", ("map twin --scene scene --altitudes 55 -o out.nc", f"{FIT} --start twin",
+                                "coverage twin --scene scene --tx-power-dbm 20 --step 30 --formats nc -o out")),
+    ("twin", "twin/channel.safetensors", ("map twin --scene scene --altitudes 55 -o out.csv",)),
+    ("twin", "twin_nn/twin.json", ("report twin_nn --scene scene -o out.html",)),
+    ("twin", "twin_nn/channel.safetensors", ("map twin_nn --scene scene --altitudes 55 -o out.tif",)),
+    ("twin", "loop/twin/twin.json", (LOCATE, "map loop/twin --scene scene --altitudes 55 -o out.nc")),
+    ("twin", "twin_corrected/twin.json twin_corrected/channel.safetensors", ("locate links/measurements.csv --twin twin_corrected -o out.csv",)),
+    ("twin", "twin_raytrace/twin.json twin_raytrace/channel.safetensors", (
+        "map twin_raytrace --scene scene --altitudes 55 -o out.nc", "report twin_raytrace --scene scene -o out.html")),
+    ("twin", "twin_kriging/twin.json twin_kriging/channel.safetensors", ("map twin_kriging --scene scene --altitudes 55 -o out.png",)),
+    ("radio map", "map.nc", (
+        "map map.nc --scene scene -o out.npz", "map map.nc --scene scene --altitudes 55 -o out.tif",
+        "map map.nc --scene scene --devices d1 -o out.png", "report scene --truth map.nc -o out.html",
+        "coverage map.nc --scene scene --tx-power-dbm 20 --formats tif,png -o out",
+        "compare survey/measurements.csv --scene scene --truth map.nc -o out", "survey scene --truth map.nc --flights 1 -o out.csv")),
+    ("transmitters", "sites/sites.csv sites/pattern.csv", (COVERAGE,)),
+    ("run folder", "loop/closeloop.json loop/residuals.csv.gz loop/groups.png", ("report loop -o out.html",)),
+    ("run folder", "comparison/compare.json", ("report comparison --scene scene -o out.html",)),
+    ("run folder", "run/config.json run/flights.csv run/comparison.csv", ("report run -o out.html",)),
+    ("command line", " ".join(f"args/{name}.args" for name in LINES), ("@{}",)),
+    ("checkpoint", "run/checkpoint.safetensors run/config.json", (RESUME,)),
 )
+
+
+def _target(kind: str, file: str, command: str) -> Target:
+    program = "" if command.startswith(("@", "marl.")) else "radiotwin "
+    return Target(kind, file, program + command.format(file), command.format(file).startswith(SLOW) or "raytrace" in file)
+
+
+TARGETS = [_target(kind, file, command) for kind, files, commands in TABLE for file in files.split() for command in commands]
