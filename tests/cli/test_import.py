@@ -2,7 +2,6 @@
 
 import json
 import shlex
-import zipfile
 from collections import Counter
 from pathlib import Path
 
@@ -134,34 +133,6 @@ def test_formulas_are_written_as_texts_and_read_as_they_were(run, tmp_path):
         assert "'=cmd" in (tmp_path / "out" / name).read_text() and "'-5" not in (tmp_path / "out" / name).read_text()
     back = read_measurements(tmp_path / "out" / "measurements.csv")
     assert list(back.table["device"]) == ["=cmd|' /C calc'!A0", "-5"], "and the repeated row was found"
-
-
-def test_a_folder_a_zip_file_and_files_are_one_import(run, tmp_path):
-    """Texts in another dialect, positions of a track, and again with what was saved."""
-    (tmp_path / "day").mkdir()
-    for i, name in enumerate(("one", "two")):
-        (tmp_path / "day" / f"{name}.txt").write_bytes(
-            f"Meßfahrt {name}\nZeit;Zelle;Pegel\n01.03.2024 10:00:0{i};a;-80,{i}\n01.03.2024 10:00:0{i + 1};a;-9{i},0\nSumme;2\n".encode("cp1252"))
-    with zipfile.ZipFile(tmp_path / "day.zip", "w", zipfile.ZIP_DEFLATED) as archive:
-        for name in ("one", "two"):
-            archive.write(tmp_path / "day" / f"{name}.txt", f"{name}.txt")
-    (tmp_path / "flight.gpx").write_text("<gpx><trk><trkseg>" + "".join(
-        f'<trkpt lat="48.{i}" lon="11.5"><ele>5</ele><time>2024-03-01T09:00:0{i}Z</time></trkpt>' for i in range(4)) + "</trkseg></trk></gpx>")
-    words = ("--columns time=Zeit,level=Pegel,device=Zelle --level-unit dBm --time-format '%d.%m.%Y %H:%M:%S' --time-zone Europe/Berlin "
-             "--track flight.gpx")
-    written = set()
-    for files in ("day", "day.zip", "day/one.txt day/two.txt"):
-        done = run(f"import {files} {words} -o out", tmp_path)
-        assert done.returncode == 0, done.stderr
-        again = run(f"import {files} --columns out/import.toml -o again", tmp_path)
-        assert again.returncode == 0, again.stderr
-        for name in FILES:
-            assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
-        written.add((tmp_path / "out" / "measurements.csv").read_bytes())
-    assert len(written) == 1 and "Readings of 2 files" in done.stdout and "separated by semicolons, decimal commas, encoding cp1252" in " ".join(done.stdout.split())
-    table = read_measurements(tmp_path / "out" / "measurements.csv").table
-    assert list(table["flight"]) == ["one", "one", "two", "two"] and list(table["rssi_dbm"]) == [-80, -90, -80.1, -91]
-    np.testing.assert_allclose(np.diff(table["receiver_y_m"]) / 111_200, [0.1, 0, 0.1], atol=1e-3)
 
 
 def test_the_command_that_is_printed_repeats_the_import(run, tmp_path):

@@ -14,7 +14,6 @@ from typer.testing import CliRunner
 from radiotwin.cli.commands import app
 from radiotwin.runtime.command import TABLES, add_output_options
 from radiotwin.runtime.console import print_rows, say
-from tests.command_line import run_planning
 
 COMMAND = Path(sys.executable).with_name("radiotwin")
 ROOT = str(Path(__file__).parents[2])
@@ -105,11 +104,9 @@ def shell(line, folder, **environment):
 
 @pytest.mark.parametrize("line, status, said", [
     ("$RADIOTWIN build-scene preset:small --check | true; exit ${PIPESTATUS[0]}", 141, 0),
-    ("$RADIOTWIN cache >&-", 0, 0),
     ("$RADIOTWIN cache --json >&-", 0, 0),
     ("$RADIOTWIN build-scene nothing 2>&-", 2, 0),
     ("$RADIOTWIN build-scene nothing 2>/dev/full", 2, 0),
-    ("$RADIOTWIN build-scene preset:small --check >/dev/full", 1, 1),
     ("$RADIOTWIN cache --json >/dev/full", 1, 1),
     ("$RADIOTWIN --help >/dev/full", 1, 1)])
 def test_an_output_that_takes_nothing_is_no_traceback(line, status, said, tmp_path):
@@ -132,16 +129,6 @@ def test_the_shell_completes(arguments, expected):
     result = subprocess.run([str(COMMAND)], capture_output=True, text=True, env=os.environ | {
         "_RADIOTWIN_COMPLETE": "complete_bash", "COMP_WORDS": arguments, "COMP_CWORD": str(len(arguments.split()) - 1)})
     assert expected in result.stdout.split()
-
-
-def test_planning_has_the_same_options(small_scene, tmp_path):
-    arguments = ["--scene", str(small_scene.folder), "--truth", "segmented", "--algorithm", "random", "--twin",
-             "log-distance", "--real-episodes", "1", "--planner-iterations", "50", "--flights", "2", "--json", "--out",
-             "run"]
-    done = run_planning(arguments, tmp_path)
-    assert done.returncode == 0, done.stderr
-    rows = json.loads(done.stdout)["tables"][0]["rows"]
-    assert [row["method"] for row in rows] == ["random", "planner", "heuristic", "greedy", "clairvoyant"]
 
 
 @pytest.mark.parametrize("given", [None, "2"])

@@ -16,7 +16,7 @@ import typer
 # Forked children would wait for the threads of their parent, which they do not have.
 os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
-from tests.fuzz.cases import CORPUS, Case, draw, listen, loads, run_case  # noqa: E402
+from tests.fuzz.cases import CORPUS, draw, listen, loads, run_case  # noqa: E402
 from tests.fuzz.honest import make_honest  # noqa: E402
 from tests.fuzz.targets import TARGETS  # noqa: E402
 
@@ -36,9 +36,9 @@ def fuzz(
     targets = [target for target in TARGETS if only in target.kind or only in target.command]
     rng, counts, started = random.Random(seed), Counter(), time.monotonic()
     known = [loads(line) for line in corpus.read_text().splitlines()] if corpus.exists() else []
-    seen = {_signature(case, "") for case in known}
-    with tempfile.TemporaryDirectory() as scratch:
-        honest, folder, listener = Path(scratch) / "honest", Path(scratch) / "case", listen()
+    seen = {(case.file, case.command, case.instead, "") for case in known}
+    with tempfile.TemporaryDirectory() as scratch, listen() as listener:
+        honest, folder = Path(scratch) / "honest", Path(scratch) / "case"
         os.environ["RADIOTWIN_CACHE"] = str(Path(scratch) / "cache")
         make_honest(honest)
         # Numba compiles the path engine once, in a process that nothing kills.
@@ -46,15 +46,18 @@ def fuzz(
                         "../warm.nc"], cwd=honest, check=True, capture_output=True)
         print(f"honest files made in {time.monotonic() - started:.0f} s", flush=True)
         started = written = time.monotonic()
-        queue = known if again else None
-        while (time.monotonic() - started < 3600 * hours) if queue is None else queue:
-            case = draw(rng, targets) if queue is None else queue.pop(0)
+        for case in known if again else iter(lambda: draw(rng, targets), None):
+            if not again and time.monotonic() - started > 3600 * hours:
+                break
             outcome = run_case(case, honest, folder, listener)
-            counts[case.kind, "cases"] += 1
-            counts[case.kind, "failed" if outcome.breaches else f"exit {outcome.status}"] += 1
+            kind = case.target.kind
+            counts[kind, "cases"] += 1
+            counts[kind, "failed" if outcome.breaches else f"exit {outcome.status}"] += 1
             for breach in outcome.breaches:
-                print(f"{breach}\n  {case.dumps()}\n  {_tail(outcome.output)}", flush=True)
-            if outcome.breaches and queue is None and (mark := _signature(case, outcome.breaches[0])) not in seen:
+                said = " | ".join(outcome.output.strip().splitlines()[-4:])[-600:]
+                print(f"{breach}\n  {case.dumps()}\n  {said}", flush=True)
+            mark = (case.file, case.command, case.instead, *outcome.breaches[:1])
+            if outcome.breaches and not again and mark not in seen:
                 seen.add(mark)
                 with open(corpus, "a") as file:
                     file.write(case.dumps() + "\n")
@@ -65,14 +68,6 @@ def fuzz(
     failed = sum(count for (_, what), count in counts.items() if what == "failed")
     print(f"{sum(count for (_, what), count in counts.items() if what == 'cases')} cases, {failed} failed")
     sys.exit(bool(failed))
-
-
-def _signature(case: Case, breach: str) -> tuple:
-    return case.file, case.command, case.instead, breach
-
-
-def _tail(output: str) -> str:
-    return " | ".join(output.strip().splitlines()[-4:])[-600:]
 
 
 def _write(path: Path | None, counts: Counter, seconds: float, seed: int) -> None:

@@ -200,42 +200,33 @@ def _hdf5(data: bytes, where: float, what: int) -> bytes:
 def _change_dataset(file: h5py.File, name: str, what: int) -> None:
     dataset = file[name]
     values, attributes = dataset[()], dict(dataset.attrs)
-    choice = what % 12
-    if choice == 0:
+    choice, text = what % 12, _text(what).replace("\x00", "")
+    if choice not in (7, 9):
         del file[name]
-    elif choice == 1:
-        del file[name]
+    if choice == 1:
         file[name] = h5py.ExternalLink(("/etc/passwd", "../canary", "canary.h5")[what % 3], "/" + name)
     elif choice == 2:
-        del file[name]
         file.create_dataset(name, (100,), "u1", external=[("../canary", 0, 100)])
     elif choice == 3:
-        del file[name]
         size = (60_000, 2**40)[what % 2]
         file.create_dataset(name, (size, size), "f4", chunks=(64, 64), compression="gzip")
     elif choice == 4:
-        del file[name]
         file[name] = h5py.SoftLink("/" + sorted(file)[0])
     elif choice == 5:
-        del file[name]
         file.create_group(name)
     elif choice == 6:
-        del file[name]
-        file[name] = np.array([_text(what).replace("\x00", "")] * max(values.size, 1), dtype=h5py.string_dtype())
+        file[name] = np.array([text] * max(values.size, 1), dtype=h5py.string_dtype())
     elif choice == 7:
-        key = sorted(attributes)[what % len(attributes)]
-        file[name].attrs[key] = (np.nan, "x" * 50_000, 0, np.zeros(10), _text(what).replace("\x00", ""))[what % 5]
+        file[name].attrs[sorted(attributes)[what % len(attributes)]] = (np.nan, "x" * 50_000, 0, np.zeros(10), text)[what % 5]
     elif choice == 8:
-        del file[name]
         layout = h5py.VirtualLayout(values.shape or (1,), "f4")
         layout[:] = h5py.VirtualSource("../canary.h5", name, values.shape or (1,))
         file.create_virtual_dataset(name, layout)
     elif choice == 9:
-        file.attrs[sorted(file.attrs)[what % len(file.attrs)]] = (_text(what).replace("\x00", ""), np.nan, -1)[what % 3]
-    elif values.dtype.kind in "fiu" and values.size:
+        file.attrs[sorted(file.attrs)[what % len(file.attrs)]] = (text, np.nan, -1)[what % 3]
+    elif choice > 9 and values.dtype.kind in "fiu" and values.size:
         values = values.astype("f8")
         values.flat[what % values.size] = float(("nan", "inf", "1e308", "-1e308", "1e9", "0", "-1")[what % 7])
-        del file[name]
         file[name] = values[:max(1, len(values) - what % 2)] if values.ndim else values
 
 
