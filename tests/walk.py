@@ -34,6 +34,13 @@ def run(command, folder):
     return done.stdout + done.stderr
 
 
+def run_program(text, folder):
+    """Run a program of a page in a folder; what it printed."""
+    done = subprocess.run([sys.executable, "-c", text], cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
 def table(text, heading):
     """Return the rows of the first table after a heading, as a list of cells without bold and code marks."""
     rows = re.findall(r"^\|(.+)\|$", text.split(heading)[1].split("\n#")[0], re.MULTILINE)

@@ -61,10 +61,7 @@ def run_demo(source: str = "preset:small", folder: Path | str = "demo", *, seed:
 
 
 def _scene(source: str, folder: Path, seed: int, on_progress: Callable[[str], None]) -> Scene:
-    """Load the scene that an earlier run left in the folder, or build it there.
-
-    A scene of another source or seed is BadInput.
-    """
+    """Load the scene that an earlier run left in the folder, or build it there."""
     if (folder / "scene.toml").is_file():
         scene = Scene.load(folder)
         found = scene.config.provenance

@@ -211,11 +211,7 @@ def _print(report: dict[str, Any]) -> None:
 
 
 def _tables(settings: "Settings") -> list[str]:
-    """Return the options that name tables of devices, receivers and tracks, to repeat an import.
-
-    import.toml cannot name files outside its folder, so the command line has to. Tracks are left
-    out if one has a setting for which there is no option.
-    """
+    """Return the options that name tables and tracks: import.toml names none outside its folder."""
     options = [text for name in ("devices", "receivers") if (table := getattr(settings, name))
                for text in (f"--{name}", table)]
     tracks, topics = settings.track, {track.topic for track in settings.track}

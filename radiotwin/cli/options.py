@@ -65,11 +65,7 @@ Cluster = Annotated[str | None, typer.Option(
 
 @contextmanager
 def open_model(path: Path) -> "Iterator[rt.RadioMap | rt.Twin]":
-    """Open a radio map (.nc, .zarr) without reading its values, or load a twin from its folder.
-
-    Raises:
-        BadInput: it is neither.
-    """
+    """Open a radio map (.nc, .zarr) without reading its values, or load a twin from its folder."""
     from radiotwin.maps.file import is_map
 
     if not is_map(path):
@@ -85,11 +81,7 @@ def split_names(text: str | None) -> list[str] | None:
 
 
 def parse_origin(text: str | None) -> "Origin | None":
-    """Parse `LATITUDE,LONGITUDE` or `LATITUDE,LONGITUDE,ALTITUDE`; None for None.
-
-    Raises:
-        BadInput: not two or three numbers, or a place that is not on the earth.
-    """
+    """Parse `LATITUDE,LONGITUDE[,ALTITUDE]`, a place on the earth; None for None."""
     from radiotwin.io.forms import as_origin
 
     if text is None:
@@ -106,9 +98,6 @@ def in_frame_of(scene: "rt.Scene | None", measurements: "rt.Measurements",
     """Convert measurements to a scene's local frame, plus a shift of `DX,DY` [m] if one is given.
 
     Without a scene they keep their frame.
-
-    Raises:
-        BadInput: not two numbers, a shift without a scene, or frames that cannot be related.
     """
     shift_m = None
     if shift is not None:
@@ -131,16 +120,9 @@ def keep_scene_apart(out: Path, scene: "rt.Scene | None") -> None:
 
 def parse_numbers(option: str, text: str, count: int | None = None,
                   form: str = "A,B,…") -> list[float]:
-    """Parse an option's value as finite numbers with commas between them.
+    """Parse an option's value as `count` (None: one or more) finite numbers with commas between.
 
-    Args:
-        option: its name, for the message.
-        text: value of the option.
-        count: required number of numbers; None: one or more.
-        form: what to give, for the message.
-
-    Raises:
-        BadInput: the value is not `count` finite numbers.
+    The message of a BadInput names the option, and says to give the `form`.
     """
     try:
         values = [float(part) for part in text.split(",")]
@@ -153,11 +135,7 @@ def parse_numbers(option: str, text: str, count: int | None = None,
 
 
 def parse_extent(text: str | None) -> tuple[float, float, float, float] | None:
-    """Parse `XMIN,YMIN,XMAX,YMAX` into x_min, x_max, y_min, y_max [m]; None for None.
-
-    Raises:
-        BadInput: not four numbers, or a minimum is not below its maximum.
-    """
+    """Parse `XMIN,YMIN,XMAX,YMAX` into x_min, x_max, y_min, y_max [m]; None for None."""
     if text is None:
         return None
     form = "XMIN,YMIN,XMAX,YMAX in metres, the minimum below the maximum"

@@ -1,6 +1,5 @@
 """A map and a GeoTIFF through the real command line: scene, survey, twin and map over hills."""
 
-import shutil
 import tomllib
 
 import numpy as np
@@ -53,18 +52,6 @@ def test_from_the_raster_to_the_map_of_a_twin(run, folder):
     table = pd.read_csv(folder / "map.csv")
     assert (table["z_m"] - table["above_ground_m"]).to_numpy() + datum_m == pytest.approx(
         hills(table["x_m"], table["y_m"]).to_numpy(), abs=0.8)
-
-
-def test_heights_above_the_ground_that_were_imported_as_altitudes(run, folder, tmp_path):
-    """Flown above hills of 500 m: taken for altitudes above the sea they are below the ground."""
-    shutil.copytree(folder / "scene", tmp_path / "scene")
-    assert run("survey scene --truth segmented --flights 1 -o measurements.csv", cwd=tmp_path).returncode == 0
-    table = pd.read_csv(tmp_path / "measurements.csv")
-    assert run("fit measurements.csv --scene scene --model log_distance -o right", cwd=tmp_path).stderr.count("below the ground") == 0
-    ground_m = hills(table["receiver_x_m"], table["receiver_y_m"])
-    table.assign(receiver_z_m=table["receiver_z_m"] - ground_m).to_csv(tmp_path / "measurements.csv", index=False)
-    done = run("fit measurements.csv --scene scene --model log_distance -o wrong", cwd=tmp_path)
-    assert done.returncode == 0 and "heights above the ground: if they are, import them as height, not as altitude" in done.stderr
 
 
 def test_paths_over_the_terrain_say_what_they_lack(run, folder):

@@ -8,7 +8,6 @@ import os
 import re
 import runpy
 import shutil
-import struct
 import zipfile
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -19,6 +18,7 @@ import numpy as np
 import pandas as pd
 
 from tests.command_line import run_in_this_process
+from tests.importing.test_tracks import GPS, ulog
 from tests.scene.readers import city_models
 from tests.worlds import fly, measured
 
@@ -264,7 +264,8 @@ def _write_foreign_logs(folder: Path) -> None:
         for i, time in enumerate(times)) + "</trkseg></trk></gpx>\n")
     (folder / "flight.nmea").write_text("".join(
         f"$GPRMC,{time:%H%M%S}.00,A,50{i / 100:07.4f},N,00800.0000,E,1,2,{time:%d%m%y},,\n" for i, time in enumerate(times)))
-    (folder / "flight.ulg").write_bytes(_ulog(times))
+    rows = [(i * 1_000_000, int(time.timestamp() * 1e6), 500_000_000 + i, 80_000_000, i) for i, time in enumerate(times)]
+    (folder / "flight.ulg").write_bytes(ulog({"vehicle_gps_position": (GPS[0], rows)}))
     (folder / "uplinks.jsonl").write_text("".join(json.dumps({
         "time": time.isoformat(), "deviceInfo": {"devEui": "n1"}, "object": {"latitude": 50 + i / 1e4, "longitude": 8.0},
         "rxInfo": [{"gatewayId": f"g{j}", "rssi": -90 - i, "snr": 5 - 3 * i, "location": {"latitude": 50.0, "longitude": 8.0 + j}}
@@ -274,16 +275,6 @@ def _write_foreign_logs(folder: Path) -> None:
     (folder / "wigle.csv").write_text(
         "WigleWifi-1.6,appRelease=2,model=X\nMAC,SSID,AuthMode,FirstSeen,Channel,RSSI,CurrentLatitude,CurrentLongitude,Type\n"
         + "".join(f"aa,b,[ESS],{time:%Y-%m-%d %H:%M:%S},6,{-60 - i},{50 + i / 1e4},8,WIFI\n" for i, time in enumerate(times)))
-
-
-def _ulog(times: list[datetime]) -> bytes:
-    def message(kind: bytes, body: bytes) -> bytes:
-        return struct.pack("<H", len(body)) + kind + body
-
-    fields = b"vehicle_gps_position:uint64_t timestamp;uint64_t time_utc_usec;int32_t lat;int32_t lon;int32_t alt;"
-    return (b"ULog\x01\x12\x35\x01" + bytes(8) + message(b"F", fields) + message(b"A", bytes(3) + b"vehicle_gps_position")
-            + b"".join(message(b"D", struct.pack("<HQQiii", 0, i * 1_000_000, int(time.timestamp() * 1e6), 500_000_000 + i, 80_000_000, i))
-                       for i, time in enumerate(times)))
 
 
 def _declare_antennas(scene: Path) -> None:
