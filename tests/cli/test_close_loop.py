@@ -133,8 +133,8 @@ THIN = {
                               put("x_m", 7.0, table=1), put("y_m", 7.0, table=1), scaled(1.0, 690e3, 5334e3, devices_too=True),
                               to_links(lambda links: links.assign(receiver=links["receiver"].map(NAMES))
                                        .rename(columns={"gain_db": "rssi_dbm"}))], []),
-    "few links": ([to_links(lambda links: links[:63]), put("receiver", "r9", [3, 50, 60])], [
-        "3 of 63 links", "receiver r9 has 3 only"]),
+    "few links": ([to_links(lambda links: links[:66]), put("receiver", "r9", [3, 50, 60])], [
+        "3 of 66 links", "receiver r9 has 3 only"]),
     "one device": ([to_links(lambda links: links[links["device"] == "d0"])], [
         "no link is to devices d1, d2, d3", "device_gain_offset not looked for: needs two"]),
     "a stuck receiver": ([put("receiver", "r9", TENTH), put("gain_db", -77, TENTH)], ["receiver r9 always reads -77"]),
@@ -175,7 +175,6 @@ WRONG = {
     "another frame": (scaled(1.0, 690e3, 5334e3), "", ["384 of 384 links left out", "100 km from the device"]),
     "no devices": (lambda links, devices: (links, devices[:0]), "", ["devices.csv: has no rows"]),
     "no base": (put("flight", "f"), "--base oracle", ["oracle", "twin, raytrace, log-distance"]),
-    "a base without a map": (put("flight", "f"), "--base raytrace", ["raytrace", "--scene"]),
     "a corrected map of none": (put("flight", "f"), "--write-scene corrected", ["--write-scene", "give it with --scene"]),
 }
 
@@ -183,6 +182,11 @@ WRONG = {
 @pytest.mark.parametrize(("edit", "arguments", "parts"), WRONG.values(), ids=WRONG)
 def test_wrong_data_is_one_message(close_loop, tmp_path, edit, arguments, parts):
     refused(tmp_path, close_loop(*edit(*open_ground()), arguments), *parts)
+
+
+def test_paths_need_a_map(close_loop):
+    done = close_loop(*open_ground(), "--base raytrace")
+    assert done.returncode == 2 and "raytrace" in done.stderr and "--scene" in done.stderr
 
 
 @pytest.mark.parametrize(("edit", "parts"), [

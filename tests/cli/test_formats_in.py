@@ -17,7 +17,7 @@ SQUARE = (50.0015, 8.0015)  # the building of `write_maps`
 CITIES = {
     **dict.fromkeys([f"town.{suffix}" for suffix in ("json", "geojson", "gpkg", "parquet", "shp", "zip")], ("", SQUARE)),
     "town.osm.pbf": ("", (47.5, 8.7)), "town.city.json": ("", (52.0, 4.37)), "town.gml": ("", (48.15, 11.57)),
-    "multi.shp": ("", (48.1, 11.4)), "roof.obj": ("--origin 48.1,11.5", (48.1, 11.5)),
+    "multi.shp": ("", (47.5, 8.7)), "roof.obj": ("--origin 48.1,11.5", (48.1, 11.5)),
     **dict.fromkeys(["city.xml", "box.glb", "box.gltf", "box.stl", "box.ply"], ("", None)), }
 
 
@@ -37,8 +37,10 @@ def test_a_file_becomes_a_scene(run, folder, tmp_path, name):
     result = run(f"build-scene {folder / name} -o scene {options}", cwd=tmp_path)
     assert result.returncode == 0 and "wrote scene: " in result.stdout, result.stderr
     config = tomllib.loads((tmp_path / "scene" / "scene.toml").read_text())
-    origin = config.get("origin")
-    assert (origin and (origin["latitude_deg"], origin["longitude_deg"])) == pytest.approx(where, abs=0.01)
+    if where is None:
+        assert "origin" not in config
+    else:
+        assert (config["origin"]["latitude_deg"], config["origin"]["longitude_deg"]) == pytest.approx(where, abs=0.01)
 
 
 def test_options_of_a_map(run, tmp_path):
@@ -49,7 +51,7 @@ def test_options_of_a_map(run, tmp_path):
     assert "wrote scene: buildings.csv, city.xml, meshes/, preview.png, scene.toml" in result.stdout
     text = (tmp_path / "scene" / "scene.toml").read_text()
     assert "latitude_deg = 47.5\n" in text and "altitude_m = 440.0" in text
-    assert len(pd.read_csv(tmp_path / "scene" / "buildings.csv")) > 1
+    assert len(pd.read_csv(tmp_path / "scene" / "buildings.csv")) >= 1
 
 
 def triangles(folder):

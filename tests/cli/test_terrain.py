@@ -54,7 +54,9 @@ def test_from_the_raster_to_the_map_of_a_twin(run, folder):
         hills(table["x_m"], table["y_m"]).to_numpy(), abs=0.8)
 
 
-def test_paths_over_the_terrain_say_what_they_lack(run, folder):
+def test_paths_over_the_terrain_say_what_they_lack_and_cells_cannot_follow_it(run, folder):
+    done = run("trace scene --solver map", cwd=folder)
+    assert done.returncode == 2 and "horizontal cells, and the lattice follows the ground" in done.stderr
     (folder / "points.csv").write_text("x_m,y_m,above_ground_m\n0,10,60\n")
     done = run("paths scene --points points.csv --devices device01 -o paths.nc", cwd=folder)
     assert done.returncode == 0, done.stderr
