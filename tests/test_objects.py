@@ -11,18 +11,11 @@ import pytest
 from pyproj import Geod
 
 import radiotwin as rt
-from radiotwin.io.forms import Origin
 from radiotwin.scene.lattice import Lattice
+from tests.worlds import placed
 
 matplotlib.use("Agg")
-ORIGIN = Origin(latitude_deg=47.5, longitude_deg=8.7)
 BAD = "<b>&\x1b"
-
-
-def placed(scene, name=None):
-    """The scene with an origin, and another name."""
-    changes = {"origin": ORIGIN} | ({} if name is None else {"name": name})
-    return replace(scene, config=scene.config.model_copy(update=changes))
 
 
 def make_map(gain_db, devices=("a", "b"), x_m=(0.0, 10.0, 20.0), ground_m=None, **attributes):
@@ -134,7 +127,7 @@ def test_plots_have_the_values_the_labels_and_the_titles(small_scene, measured, 
 
 def test_plots_in_degrees_where_the_origin_is_known(small_scene, measured):
     scene = placed(small_scene)
-    for ax in (scene.plot(), make_map(-80.0, **{f"origin_{name}": value for name, value in ORIGIN}).plot(),
+    for ax in (scene.plot(), make_map(-80.0, origin_latitude_deg=47.5, origin_longitude_deg=8.7, origin_altitude_m=0.0).plot(),
                measured.plot(scene=scene)):
         assert (ax.get_xlabel(), ax.get_ylabel()) == ("longitude [°]", "latitude [°]")
         assert 8.69 < np.mean(ax.get_xlim()) < 8.71 and 47.49 < np.mean(ax.get_ylim()) < 47.51
@@ -205,7 +198,7 @@ def test_load_brings_back_what_save_wrote(small_scene, measured, twin, tmp_path)
 
 
 def test_a_saved_scene_is_the_same_and_erases_nothing(small_scene, tmp_path):
-    moved = placed(small_scene, "another")
+    moved = placed(small_scene, name="another")
     moved.save(tmp_path / "copy")
     back = rt.Scene.load(tmp_path / "copy")
     assert back.content_hash() == small_scene.content_hash() and back.config == moved.config

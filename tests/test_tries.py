@@ -9,6 +9,7 @@ import pytest
 
 import radiotwin as rt
 from radiotwin.io.forms import Origin
+from tests.worlds import placed
 
 ORIGIN = Origin(latitude_deg=47.5, longitude_deg=8.7)
 METRES_A_DEGREE = np.array([111_170.0, 75_320.0])  # of latitude and longitude, at 47.5 degrees
@@ -19,8 +20,7 @@ LEVEL_DBM, EXPONENT, SD_DB = -60.0, 2.7, 2.0  # of the made links: at 100 m
 def folder(small_scene, tmp_path_factory):
     """A scene folder with an origin, and a log of two flights and four masts beside it."""
     folder = tmp_path_factory.mktemp("tries")
-    config = small_scene.config.model_copy(update={"origin": ORIGIN, "devices": []})
-    type(small_scene)(small_scene.folder, config).save(folder / "town")
+    placed(small_scene, devices=[]).save(folder / "town")
     rng = np.random.default_rng(0)
     masts_m = np.array([[110.0, 90.0], [200.0, 220.0], [240.0, 70.0], [50.0, 240.0]])
     masts = pd.DataFrame({"device": list("ABCD"), **degrees(masts_m), "height_m": 75.0})

@@ -1,6 +1,7 @@
 """Worlds that tests of several packages share: open ground, by plain formulas of their own, and a traced city."""
 
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,6 +15,7 @@ from radiotwin.closeloop.predict.baselines import grow_trees
 from radiotwin.closeloop.predict.predictor import CombinedPrediction
 from radiotwin.closeloop.predict.weights import Combination
 from radiotwin.effects.registry import catalogue
+from radiotwin.io.forms import Origin
 from radiotwin.links.links import Columns, Ends, Flown, Links, World
 from radiotwin.links.measurements import Measurements
 from radiotwin.maps.radiomap import RadioMap
@@ -65,6 +67,12 @@ def measured(world, **columns):
                             "y_m": world.device_m[:, 1], "z_m": world.device_m[:, 2], "role": "anchor",
                             "frequency_hz": 2.4e9})
     return Measurements(table, devices)
+
+
+def placed(scene, **changes):
+    """Return a scene with an origin, and other changes of what it declares."""
+    origin = Origin(latitude_deg=47.5, longitude_deg=8.7)
+    return replace(scene, config=scene.config.model_copy(update={"origin": origin} | changes))
 
 
 def thinned(flown, step):

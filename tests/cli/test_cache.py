@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from radiotwin.maps.survey import fly_survey, segmented_truth
+from radiotwin.maps.survey import fly_survey
 from radiotwin.runtime.pieces import PieceStore, pieces_folder
 
 
@@ -41,8 +41,7 @@ def test_without_a_cache_it_is_empty(run, own_cache, tmp_path):
 
 @pytest.fixture
 def flown(small_scene, tmp_path):
-    fly_survey(small_scene, segmented_truth(small_scene), flights=2, pattern="random-waypoint", seed=0,
-               noise_db=0.0).save(tmp_path / "m.csv")
+    fly_survey(small_scene, "segmented", flights=2, seed=0).save(tmp_path / "m.csv")
     return tmp_path / "m.csv"
 
 

@@ -14,9 +14,10 @@ import pytest
 
 from radiotwin.errors import RunFailed
 from radiotwin.maps.export import EXPORTERS
-from radiotwin.maps.survey import fly_survey, segmented_truth
+from radiotwin.maps.survey import fly_survey
 from radiotwin.trace.link_job import BatchStore, LinkBatch
 from tests.command_line import run_planning
+from tests.worlds import placed
 
 DISK_BYTES = 1024 * 1024
 IMPORT = """length_unit = "m"
@@ -48,12 +49,8 @@ def disk(tmp_path_factory):
 def inputs(small_scene, tmp_path_factory, run):
     """A scene with an origin, measurements, a twin of them, and a result of close-loop."""
     folder = tmp_path_factory.mktemp("inputs")
-    shutil.copytree(small_scene.folder, folder / "scene", ignore=shutil.ignore_patterns("cache"))
-    toml = folder / "scene" / "scene.toml"
-    origin = "[origin]\nlatitude_deg = 47.5\nlongitude_deg = 8.7\n[mission]"
-    toml.write_text(toml.read_text().replace("[mission]", origin))
-    truth = segmented_truth(small_scene)
-    fly_survey(small_scene, truth, flights=2, pattern="random-waypoint", seed=0).save(folder / "m.csv")
+    placed(small_scene).save(folder / "scene")
+    fly_survey(small_scene, "segmented", flights=2, seed=0).save(folder / "m.csv")
     assert run("fit m.csv --scene scene --model log_distance -o twin", folder).returncode == 0
     (folder / "import.toml").write_text(IMPORT)
     stored = Path(__file__).parents[1] / "twin" / "stored"

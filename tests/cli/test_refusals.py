@@ -13,6 +13,7 @@ from radiotwin.links.measurements import read_measurements
 from radiotwin.runtime import cuda
 from radiotwin.scene import Scene
 from tests.scene.readers import city_models
+from tests.worlds import placed
 
 TOWN = Path(__file__).parents[1] / "scene" / "readers" / "town.osm"
 SITES = "device,x_m,y_m,z_m,tx_power_dbm\nroof,110,90,60,30\n"
@@ -41,7 +42,7 @@ def folder(scene_to_map, tmp_path_factory):
     (folder / "unknown.csv").write_text((folder / "devices.csv").read_text().replace("anchor", "unknown"))
     edited(folder / "scene", folder / "negative", "frequency_hz = 2400000000.0", "frequency_hz = -2.4e9")
     edited(folder / "scene", folder / "walled", "x_m = 160.0\ny_m = 120.0", "x_m = 130.0\ny_m = 170.0")
-    edited(folder / "scene", folder / "placed", "[mission]", "[origin]\nlatitude_deg = 47.5\nlongitude_deg = 8.7\n[mission]")
+    placed(scene).save(folder / "placed")
     shutil.copytree(folder / "scene", folder / "cut")
     mesh = folder / "cut" / "meshes" / "building_000.ply"
     mesh.write_bytes(mesh.read_bytes()[:mesh.stat().st_size // 2])

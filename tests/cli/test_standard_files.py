@@ -1,7 +1,5 @@
 """Exports through the real command line: scenes, maps, gains at points; and bad requests."""
 
-import shutil
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -9,15 +7,13 @@ import xarray as xr
 
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.scene import Scene
+from tests.worlds import placed
 
 
 @pytest.fixture
 def folder(small_scene, tmp_path):
     """A folder with a scene that has an origin, and a radio map of it."""
-    shutil.copytree(small_scene.folder, tmp_path / "scene", ignore=shutil.ignore_patterns("cache"))
-    toml = tmp_path / "scene" / "scene.toml"
-    origin = "[origin]\nlatitude_deg = 47.5\nlongitude_deg = 8.7\n[mission]"
-    toml.write_text(toml.read_text().replace("[mission]", origin))
+    placed(small_scene).save(tmp_path / "scene")
     lattice = small_scene.lattice
     gain_db = -60 - np.arange(2 * np.prod(lattice.shape)) / 100
     radio_map = RadioMap.build(["d0", "d1"], lattice, gain_db, gain_db > -70, attributes={"source": "test"})
