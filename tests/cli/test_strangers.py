@@ -18,6 +18,7 @@ import pandas as pd
 import pytest
 import torch
 
+from radiotwin.runtime import cuda
 from tests.cli.conftest import FIT, MAP, SURVEY
 from tests.command_line import run_planning
 from tests.fuzz.cases import listen
@@ -322,6 +323,7 @@ def a_thousand_million_uavs(folder):
 @pytest.mark.parametrize("prepare, command, message, status, limits", CASES)
 def test_a_stranger(strangers_folder, monkeypatch, prepare, command, message, status, limits):
     folder = strangers_folder
+    cuda.tracing_refusal()  # asked once in a process, and may start another one
     for name, limit in limits.items():
         monkeypatch.setenv(f"RADIOTWIN_MAX_{name}", str(limit))
     with listen() as listener:
