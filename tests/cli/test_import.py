@@ -185,3 +185,14 @@ def test_a_spectrum_scan_in_a_band(run, tmp_path):
     words = "import s.csv --time-zone UTC --columns x='always 1',y='always 2' --length-unit m -o out"
     assert run(f"{words} --band-hz 1e6,1.2e6", tmp_path).returncode == 0
     assert read_measurements(tmp_path / "out" / "measurements.csv").table["rssi_dbm"].tolist() == pytest.approx([-26.9897], abs=1e-3)
+
+
+def test_two_files_with_the_track_that_their_settings_name(run, tmp_path):
+    for name in ("a.csv", "b.csv"):
+        (tmp_path / name).write_text("t,l\n1709287200,-80\n1709287201,-81\n")
+    (tmp_path / "flight.csv").write_text("time_s,latitude,longitude\n1709287199,48.1,11.5\n1709287202,48.2,11.5\n")
+    (tmp_path / "own.toml").write_text('level_unit = "dBm"\ntime_format = "epoch s"\nlength_unit = "m"\n[columns]\nlevel = "l"\n'
+                                       'time = "t"\ndevice = "always x"\n[[track]]\nfile = "flight.csv"\n')
+    done = run("import a.csv b.csv --columns own.toml -o out", tmp_path)
+    assert done.returncode == 0 and "Readings of 2 files" in done.stdout, done.stderr
+    assert read_measurements(tmp_path / "out" / "measurements.csv").flights == ["a", "b"]
