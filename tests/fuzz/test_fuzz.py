@@ -58,7 +58,7 @@ def test_damaged_files_keep_the_rule(run, draws):
     keeps_the_rule()
 
 
-@pytest.mark.parametrize("case", KNOWN, ids=[f"{case.kind}-{number}" for number, case in enumerate(KNOWN, start=1)])
+@pytest.mark.parametrize("case", KNOWN, ids=[f"{case.target.kind}-{number}" for number, case in enumerate(KNOWN, start=1)])
 def test_what_failed_once_keeps_the_rule(run, case):
     outcome = run(case)
     assert not outcome.breaches, f"{outcome.breaches}\n{outcome.output[-2000:]}"
