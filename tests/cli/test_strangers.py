@@ -29,7 +29,8 @@ HERE = Path(__file__).parents[1]
 STORED, CLOSELOOP = HERE / "twin" / "stored", HERE / "closeloop" / "sample" / "closeloop.json"
 SQUARE = [[8.001, 50.001], [8.002, 50.001], [8.002, 50.002], [8.001, 50.002], [8.001, 50.001]]
 MAP_IN = "survey scene --truth map.nc --flights 1 -o out.csv"
-PLANNING = "--scene scene --truth segmented --algorithm random --twin log-distance --real-episodes 1 --compare none --out run"
+PLANNING = "--scene scene --truth segmented --algorithm random --twin log-distance --real-episodes 1 --compare none --planner-iterations 50 " \
+           "--flights 2 --out run"
 LINKS = ("time_s,flight,receiver,receiver_x_m,receiver_y_m,receiver_z_m,device,gain_db\n", "0,f,r,1,2,60,d0,-80\n")
 CASES = []
 
