@@ -72,7 +72,7 @@ def test_a_file_and_a_table_of_devices_are_enough(run, tmp_path):
         rmse_db = np.sqrt((links[f"{when}_db"] ** 2).mean())
         assert rmse_db == pytest.approx(report["error"][when]["rmse_db"], abs=1e-3)
     page = (tmp_path / "result" / "closeloop.html").read_text()
-    assert page.count("data:image/png;base64,") == 5 and "Receiver gain offset" in page
+    assert page.count("data:image/png;base64,") >= 5 and "Receiver gain offset" in page
     shown = run("report result", tmp_path)
     assert shown.returncode == 0 and "no scene" in shown.stdout, shown.stderr
     whole = (tmp_path / "result" / "report.html").read_text()
