@@ -368,15 +368,6 @@ def expected_flight(mission: Mission, value: np.ndarray, tour: np.ndarray, count
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _list(candidates: Candidates, level: int, row: int, column: int, place: int) -> None:
-    """Fill the entry of a place in `candidates`: all devices, the strongest link first."""
-    heard = candidates.value[level, :, row, column]
-    order = np.argsort(-heard, kind="mergesort")  # stable: of equal links the first device
-    candidates.device[place], candidates.worth[place] = order, heard[order]
-    candidates.listed[place] = True
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def _walk(mission: Mission, candidates: Candidates, uav: int, tour: np.ndarray, count: int,
           changed: int, course: Course, mask: np.ndarray) -> None:
     """Simulate one UAV's moves from when it sets out to the waypoint `changed`, into `course`."""
@@ -390,7 +381,10 @@ def _walk(mission: Mission, candidates: Candidates, uav: int, tour: np.ndarray, 
     while battery > 0:
         place = (level * rows + row) * columns + column
         if not candidates.listed[place]:
-            _list(candidates, level, row, column, place)
+            heard = candidates.value[level, :, row, column]
+            order = np.argsort(-heard, kind="mergesort")  # stable: of equal links the first device
+            candidates.device[place], candidates.worth[place] = order, heard[order]
+            candidates.listed[place] = True
         places[slot], batteries[slot] = place, battery
         before = reached
         action, reached, hovered = next_action(mission, uav, row, column, battery, tour, count,
