@@ -14,7 +14,6 @@ from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -119,20 +118,11 @@ RASTERS = ("received_power_dbm", "received_power_sd_db", "best_server", "snr_db"
            "rate_bps", "coverage_probability")
 
 
-def _require_features() -> Any:
-    """Import `rasterio.features`; raise BadInput if it is not installed."""
-    try:
-        from rasterio import features
-    except ImportError as error:
-        raise BadInput("coverage.gpkg: GeoPackages are written with the package rasterio, and "
-                       f"{error.name} is not installed; install it with `pip install "
-                       "'radiotwin[gis]'`") from None
-    return features
-
-
 def _write_geopackage(coverage: Coverage, scene: Scene, path: Path) -> None:
     """Write a layer for each raster, of a multipolygon for each class, and one of transmitters."""
-    features = _require_features()
+    require_rasterio(path)
+    from rasterio import features
+
     grid, origin = coverage.grid, scene.config.origin
     transform = georeference(grid.x_m, grid.y_m, grid.step_m, origin)["transform"]
 
@@ -305,7 +295,7 @@ def write_formats(coverage: Coverage, scene: Scene, folder: Path, formats: list[
 
 FORMATS: dict[str, Callable[[Scene], object]] = {
     "nc": lambda scene: None, "tif": lambda scene: require_rasterio(Path("received_power.tif")),
-    "gpkg": lambda scene: _require_features(),
+    "gpkg": lambda scene: require_rasterio(Path("coverage.gpkg")),
     "kmz": lambda scene: require_origin(scene, "coverage.kmz: Google Earth needs"),
     "png": lambda scene: None}
 """Formats by name, each with a check that raises BadInput if a scene cannot be written so."""

@@ -50,21 +50,8 @@ DEAF_DB, DEAF_SDS = 6.0, 4.5  # excess over the usual limit of an insensitive re
 MAX_NAMED = 5  # receivers in a note
 
 
-@dataclass(frozen=True, eq=False)
-class CrudeLevel:
-    """Crude predictions of n levels.
-
-    Attributes:
-        mean_db: (n,) predicted levels [dB].
-        sd_db: standard deviation of their errors [dB].
-    """
-
-    mean_db: np.ndarray
-    sd_db: float
-
-
 def crude_level(level_db: np.ndarray, limit_db: np.ndarray, distance_m: np.ndarray,
-                device: np.ndarray, receiver: np.ndarray) -> CrudeLevel:
+                device: np.ndarray, receiver: np.ndarray) -> tuple[np.ndarray, float]:
     """Predict levels by a line over lg distance and an offset per device and receiver.
 
     Links (n,) that were not detected count as below the limit, by EM for censored normal levels
@@ -109,7 +96,7 @@ def crude_level(level_db: np.ndarray, limit_db: np.ndarray, distance_m: np.ndarr
         shift = np.where(limited, below * -ratio, 0.0)
         filled_db = np.where(blank, mean_db + sd_db * shift, level_db)
         variance = np.where(limited, sd_db**2 * np.clip(1 - ratio * (ratio + z), 0, 1), 0.0)
-    return CrudeLevel(mean_db, sd_db)
+    return mean_db, sd_db
 
 
 def _frequent(label: np.ndarray) -> np.ndarray:
@@ -305,13 +292,13 @@ def _estimates(links: Links, rows: list[np.ndarray], declared_db: float,
     limits_db = np.where(np.isfinite(lowest_db), lowest_db, lowest_db.min())
     block = evidence_blocks(links)
     for _ in range(ROUNDS):
-        crude = crude_level(links.level_db, limits_db[links.receiver], links.distance_m,
-                            links.device, links.receiver)
-        z = np.where(blank, 0.0, (links.level_db - crude.mean_db) / crude.sd_db)
+        crude_db, crude_sd_db = crude_level(links.level_db, limits_db[links.receiver],
+                                            links.distance_m, links.device, links.receiver)
+        z = np.where(blank, 0.0, (links.level_db - crude_db) / crude_sd_db)
         links_per_observation = design_effect(block, z)
-        scale_db = np.full(len(links), SD_SHARE * crude.sd_db)
+        scale_db = np.full(len(links), SD_SHARE * crude_sd_db)
         *found, pooled = [
-            receiver_limit(links.level_db[part], crude.mean_db[part], scale_db[part],
+            receiver_limit(links.level_db[part], crude_db[part], scale_db[part],
                            links_per_observation, declared_db)
             for part in (*rows, np.arange(len(links)))]
         before_db, limits_db = limits_db, np.array([

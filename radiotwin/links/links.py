@@ -322,8 +322,8 @@ class World:
     is_gain: bool
 
 
-class _FromPart(Generic[Value]):
-    """Descriptor: an attribute of one part of `Links`, such as `columns`, under the same name."""
+class FromPart(Generic[Value]):
+    """Descriptor: an attribute of a part, such as `columns` of `Links`, under the same name."""
 
     def __init__(self, part: str) -> None:
         self._part = part
@@ -331,8 +331,8 @@ class _FromPart(Generic[Value]):
     def __set_name__(self, owner: type, name: str) -> None:
         self._get = attrgetter(f"{self._part}.{name}")
 
-    def __get__(self, links: Links, owner: type) -> Value:
-        return self._get(links)
+    def __get__(self, whole: Any, owner: type) -> Value:
+        return self._get(whole)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -353,37 +353,37 @@ class Links:
     world: World
     notes: tuple[str, ...] = ()
 
-    level_db = _FromPart[np.ndarray]("columns")
-    limit_db = _FromPart[np.ndarray]("columns")
-    receiver_m = _FromPart[np.ndarray]("columns")
-    device = _FromPart[np.ndarray]("columns")
-    receiver = _FromPart[np.ndarray]("columns")
-    flight = _FromPart[np.ndarray]("columns")
-    time_s = _FromPart[np.ndarray]("columns")
-    heading_deg = _FromPart[np.ndarray]("columns")
-    pitch_deg = _FromPart[np.ndarray | None]("columns")
-    roll_deg = _FromPart[np.ndarray | None]("columns")
-    quality = _FromPart[np.ndarray | None]("columns")
-    known_los = _FromPart[np.ndarray | None]("columns")
-    time_in_flight_s = _FromPart[np.ndarray]("columns")
-    evidence = _FromPart[np.ndarray | None]("columns")
-    track = _FromPart[np.ndarray]("columns")
-    device_names = _FromPart[list[str]]("ends")
-    receiver_names = _FromPart[list[str]]("ends")
-    flight_names = _FromPart[list[str]]("ends")
-    device_m = _FromPart[np.ndarray]("ends")
-    anchors = _FromPart[frozenset[int]]("ends")
-    boresight_deg = _FromPart[np.ndarray]("ends")
-    tilt_deg = _FromPart[np.ndarray]("ends")
-    declared = _FromPart[Declared]("ends")
-    reads = _FromPart[np.ndarray | None]("ends")
-    first_s = _FromPart[float]("ends.flown")
-    last_s = _FromPart[float]("ends.flown")
-    tracks = _FromPart[Tracks]("ends.flown")
-    time_restarts = _FromPart[bool]("ends.flown")
-    frequency_hz = _FromPart[float]("world")
-    city = _FromPart[CityMap | None]("world")
-    is_gain = _FromPart[bool]("world")
+    level_db = FromPart[np.ndarray]("columns")
+    limit_db = FromPart[np.ndarray]("columns")
+    receiver_m = FromPart[np.ndarray]("columns")
+    device = FromPart[np.ndarray]("columns")
+    receiver = FromPart[np.ndarray]("columns")
+    flight = FromPart[np.ndarray]("columns")
+    time_s = FromPart[np.ndarray]("columns")
+    heading_deg = FromPart[np.ndarray]("columns")
+    pitch_deg = FromPart[np.ndarray | None]("columns")
+    roll_deg = FromPart[np.ndarray | None]("columns")
+    quality = FromPart[np.ndarray | None]("columns")
+    known_los = FromPart[np.ndarray | None]("columns")
+    time_in_flight_s = FromPart[np.ndarray]("columns")
+    evidence = FromPart[np.ndarray | None]("columns")
+    track = FromPart[np.ndarray]("columns")
+    device_names = FromPart[list[str]]("ends")
+    receiver_names = FromPart[list[str]]("ends")
+    flight_names = FromPart[list[str]]("ends")
+    device_m = FromPart[np.ndarray]("ends")
+    anchors = FromPart[frozenset[int]]("ends")
+    boresight_deg = FromPart[np.ndarray]("ends")
+    tilt_deg = FromPart[np.ndarray]("ends")
+    declared = FromPart[Declared]("ends")
+    reads = FromPart[np.ndarray | None]("ends")
+    first_s = FromPart[float]("ends.flown")
+    last_s = FromPart[float]("ends.flown")
+    tracks = FromPart[Tracks]("ends.flown")
+    time_restarts = FromPart[bool]("ends.flown")
+    frequency_hz = FromPart[float]("world")
+    city = FromPart[CityMap | None]("world")
+    is_gain = FromPart[bool]("world")
 
     def __len__(self) -> int:
         return len(self.level_db)
@@ -560,10 +560,6 @@ class Links:
         """Place the devices at (k, 3) [m], and drop the links of those at NaN."""
         rows = np.isfinite(device_m).all(axis=1)[self.device]
         return self.with_devices(np.nan_to_num(device_m)).select(rows)
-
-    def with_first_time(self, first_s: float) -> Links:
-        """Return a copy with another time of the first measurement [s], see `Flown`."""
-        return self.with_ends(flown=replace(self.ends.flown, first_s=first_s))
 
     def with_city(self, city: CityMap | None) -> Links:
         """Return a copy over another map; None: without one."""

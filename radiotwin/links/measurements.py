@@ -387,7 +387,8 @@ def read_measurements(path: Path | str, devices_path: Path | str | None = None) 
         raise BadInput(f"{devices_path} is a link out of its folder; name the table that it leads "
                        "to with --devices")
     origin, of_devices = read_frame(path.parent), read_frame(devices_path.parent)
-    devices, notes = _read_devices(devices_path, origin, of_devices)
+    devices, notes = _devices(devices_path, read_cells(devices_path), origin, of_devices,
+                              lambda row: f"row {row + 2}")
     if table.empty:
         raise BadInput(f"{path}: has no rows; it needs at least one measured link")
     undeclared = ~table["device"].isin(devices["device"])
@@ -414,13 +415,7 @@ def read_devices(path: Path | str) -> pd.DataFrame:
     """
     path = Path(path)
     own = read_frame(path.parent)
-    return _read_devices(path, own, own)[0]
-
-
-def _read_devices(path: Path, origin: Origin | None,
-                  own: Origin | None) -> tuple[pd.DataFrame, tuple[str, ...]]:
-    """Read devices, convert x and y from the frame about `own` to `origin`, and collect notes."""
-    return _devices(path, read_cells(path), origin, own, lambda row: f"row {row + 2}")
+    return _devices(path, read_cells(path), own, own, lambda row: f"row {row + 2}")[0]
 
 
 def _devices_of_links(table: pd.DataFrame) -> pd.DataFrame:

@@ -51,9 +51,8 @@ def join_links(measurements: Measurements, scene: Scene) -> Links:
     if outside.any():
         notes.append(f"{outside.sum():,} of {len(outside):,} links have their receiver outside the "
                      "3D map")
-    return _join(measurements, measurements.table.reset_index(drop=True), scene,
-                 measurements.level_db, receiver_m, device_m, measurements.device_index,
-                 np.arange(len(device_m)), notes)
+    return _join(measurements, scene, measurements.level_db, receiver_m, device_m,
+                 np.ones(len(device_m), dtype=bool), notes)
 
 
 def prepare_links(measurements: Measurements, scene: Scene | None,
@@ -139,9 +138,8 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
                        f"{least} are needed" + f", {least // 2} of them detected" * (least > 1)
                        + ": " + ("; ".join(notes) or "measure more"))
     refuse_empty_levels(level_db[keep], measurements.level_column)
-    device = (np.cumsum(placed) - 1)[device_index[keep]]
-    links = _join(measurements, table[keep], scene, level_db[keep], receiver_m[keep],
-                  device_m[placed], device, np.flatnonzero(placed), notes)
+    links = _join(measurements.select(keep), scene, level_db[keep], receiver_m[keep],
+                  device_m[placed], placed, notes)
     links = links if to_locate or devices_move(links) else links.with_notes(*end_notes(links))
     return links.with_notes(RESTART_NOTE) if links.time_restarts else links
 
@@ -170,15 +168,15 @@ def _ground_m(scene: Scene, device_m: np.ndarray, receiver_m: np.ndarray) -> np.
     return below_m
 
 
-def _join(measurements: Measurements, table: pd.DataFrame, scene: Scene | None,
-          level_db: np.ndarray, receiver_m: np.ndarray, device_m: np.ndarray, device: np.ndarray,
-          kept_devices: np.ndarray, notes: list[str]) -> Links:
-    """Make the links of n measurements and k devices, with radios and limits of detection.
+def _join(measurements: Measurements, scene: Scene | None, level_db: np.ndarray,
+          receiver_m: np.ndarray, device_m: np.ndarray, kept: np.ndarray, notes: list[str]
+          ) -> Links:
+    """Make the links of n measurements, with radios and limits of detection.
 
-    `table`, `level_db`, `receiver_m` and `device` are those of the n links, `device` (n,) an index
-    of `device_m` (k, 3); `kept_devices` (k,) are rows of `measurements.devices`. Notes are added to
-    `notes` in place.
+    Levels (n,), receivers (n, 3) and devices (k, 3) are corrected ones; `kept` is the mask of these
+    among all devices. Notes are added to `notes` in place.
     """
+    table, devices = measurements.table, measurements.devices[kept]
     receiver, receiver_names = pd.factorize(table["receiver"], sort=True)
     flight, flight_names = pd.factorize(table["flight"])
     heading_deg = _column(table, "heading_deg")
@@ -190,7 +188,6 @@ def _join(measurements: Measurements, table: pd.DataFrame, scene: Scene | None,
     notes += ceiling_notes(receiver, receiver_names, level_db)
     is_gain = measurements.level_column == "gain_db"
     frequency_hz = _frequency_hz(measurements, scene)
-    devices = measurements.devices.iloc[kept_devices]
     notes += _other_frequencies(_column(devices, "frequency_hz"), frequency_hz)
     radios, assumed = complete(list(devices["device"]), radios_of(
         devices, measurements.patterns, scene), not is_gain, scene)
@@ -200,15 +197,16 @@ def _join(measurements: Measurements, table: pd.DataFrame, scene: Scene | None,
         radios = (Radio(),) * len(devices)
     columns = Columns(
         level_db=level_db, limit_db=np.full(len(level_db), -np.inf), receiver_m=receiver_m,
-        device=device, receiver=receiver, flight=flight, time_s=_column(table, "time_s"),
-        heading_deg=heading_deg % 360, pitch_deg=_column(table, "pitch_deg"),
-        roll_deg=_column(table, "roll_deg"), quality=_column(table, "quality"))
+        device=(np.cumsum(kept) - 1)[measurements.device_index], receiver=receiver, flight=flight,
+        time_s=_column(table, "time_s"), heading_deg=heading_deg % 360,
+        pitch_deg=_column(table, "pitch_deg"), roll_deg=_column(table, "roll_deg"),
+        quality=_column(table, "quality"))
     # A device with a declared pattern needs no estimated sector about its azimuth.
     of_sector = np.array([radio.antenna is None for radio in radios]) if radios else True
     ends = Ends(
         device_names=list(devices["device"]), receiver_names=list(receiver_names),
         flight_names=list(flight_names), device_m=device_m,
-        anchors=frozenset(np.flatnonzero(measurements.is_anchor[kept_devices]).tolist()),
+        anchors=frozenset(np.flatnonzero(measurements.is_anchor[kept]).tolist()),
         boresight_deg=np.where(of_sector, _column(devices, "azimuth_deg"), np.nan),
         tilt_deg=np.where(of_sector, _column(devices, "tilt_deg"), np.nan),
         declared=Declared(radios, frequency_hz, not is_gain, receiver_antenna),

@@ -315,8 +315,10 @@ def read_site_table(path: Path | str, cells: pd.DataFrame, where: Callable[[int]
     (ROWS if end is None else DEVICES).check(len(cells), path)
     header = list(map(str, cells.columns))
     columns, unused = _columns(path, header, crs)
-    for quantity in _redundant_position(columns.keys(), crs, prefers_globe):
-        unused[columns.pop(quantity)] = "the position is known already"
+    if {"latitude", "x"} <= columns.keys() and (crs or prefers_globe):
+        for quantity in ("latitude", "longitude") if crs else ("x", "y"):
+            if quantity in columns:
+                unused[columns.pop(quantity)] = "the position is known already"
     key = None
     if end is not None:
         key, others = _name_column(path, cells, end, names, set(columns.values()))
@@ -382,14 +384,6 @@ def _unused_note(path: Path | str, unused: Mapping[str, str]) -> list[str]:
     columns = listed(f"{name or 'one without a name'}" + f" ({why})" * bool(why)
                      for name, why in reasons.items())
     return [f"{Path(path).name}: column{'s' * (len(unused) > 1)} not used: {columns}"]
-
-
-def _redundant_position(given: Collection[str], crs: bool, prefers_globe: bool) -> tuple[str, ...]:
-    """Return the pair to ignore: latitude, longitude if `crs`, x, y if `prefers_globe`, or none."""
-    if not {"latitude", "x"} <= set(given) or not (crs or prefers_globe):
-        return ()
-    pair = ("latitude", "longitude") if crs else ("x", "y")
-    return tuple(name for name in pair if name in given)
 
 
 def _columns(path: Path | str, header: Sequence[str],

@@ -28,9 +28,9 @@ def residual_variable(name: str, links: Links, mean_db: np.ndarray) -> np.ndarra
     return VARIABLES[name](links, mean_db)
 
 
-def _cells(position_m: np.ndarray) -> np.ndarray:
+def ground_squares(position_m: np.ndarray, side_m: float = CELL_M) -> np.ndarray:
     """Return the index (n,) of the square of ground that each position (n, 3) [m] is in."""
-    squares = np.floor(position_m[:, :2] / CELL_M).astype(np.int64)
+    squares = np.floor(position_m[:, :2] / side_m).astype(np.int64)
     return np.unique(squares, axis=0, return_inverse=True)[1].ravel()
 
 
@@ -53,9 +53,9 @@ VARIABLES: dict[str, Callable[[Links, np.ndarray], np.ndarray]] = {
     "diffraction_parameter": lambda links, _: links.diffraction_parameter,
     "quality": lambda links, _: (np.full(len(links), np.nan) if links.quality is None
                                  else links.quality),
-    "place_of_ray": lambda links, _: _cells(
+    "place_of_ray": lambda links, _: ground_squares(
         0.5 * (links.receiver_m + links.device_m[links.device])),
-    "place_of_receiver": lambda links, _: _cells(links.receiver_m),
+    "place_of_receiver": lambda links, _: ground_squares(links.receiver_m),
 }
 
 

@@ -376,12 +376,6 @@ def _require_zarr(path: Path) -> Any:
                 "`pip install 'radiotwin[zarr]'`, or take a .nc file")
 
 
-def _check_zarr_target(path: Path) -> None:
-    """Raise BadInput unless a Zarr folder can be written to a path."""
-    _require_zarr(path)
-    require_folder(path, ("*",), mark=METADATA)
-
-
 def _write_zarr(top: xr.Dataset, dtypes: dict[str, np.dtype], blocks: Iterable[MapBlock],
                path: Path | str) -> None:
     """Write a radio map as a Zarr folder by the CF conventions; see `write_parts`.
@@ -389,7 +383,7 @@ def _write_zarr(top: xr.Dataset, dtypes: dict[str, np.dtype], blocks: Iterable[M
     Each block is a chunk, so one block is in memory at a time.
     """
     path = Path(path)
-    _check_zarr_target(path)
+    check_target(path)
     zarr = _require_zarr(path)
     shape = tuple(top.sizes[name] for name in DIMS)
     first = next(parts_of(shape[1:]))
@@ -512,7 +506,8 @@ def _as_bool(stored: xr.Variable) -> xr.Variable:
 def check_target(path: Path | str) -> None:
     """Raise BadInput unless a radio map can be written to a path; call it before long work."""
     if is_zarr(path):
-        _check_zarr_target(Path(path))
+        _require_zarr(Path(path))
+        require_folder(path, ("*",), mark=METADATA)
     else:
         require_writable(path)
 

@@ -289,7 +289,7 @@ def fly_survey(scene: Scene | Path | str, truth: RadioMap | str = "traced", *, f
             for number, uav in enumerate(scene.config.uavs):
                 rng = np.random.default_rng([seed, flight, number])
                 cells = fly(scene, uav, pattern, rng)
-                index = _lattice_index(scene, uav, cells)
+                index = np.ravel_multi_index((_level(scene, uav), *cells.T), scene.lattice.shape)
                 # NumPy refuses -0.0 for a standard deviation.
                 error_db = rng.normal(0, abs(noise_db), (len(gain_db), len(index)))
                 level_db = gain_db[:, index] + error_db
@@ -337,12 +337,6 @@ def fly(scene: Scene, uav: UavConfig, pattern: str, rng: np.random.Generator) ->
 def _level(scene: Scene, uav: UavConfig) -> int:
     """Return the index of a UAV's altitude."""
     return int(np.abs(scene.lattice.z_m - uav.altitude_m).argmin())
-
-
-def _lattice_index(scene: Scene, uav: UavConfig, cells: np.ndarray) -> np.ndarray:
-    """Return the flat index (slots,) in the lattice of cells (slots, 2) at a UAV's altitude."""
-    level = np.full(len(cells), _level(scene, uav))
-    return np.ravel_multi_index((level, cells[:, 0], cells[:, 1]), scene.lattice.shape)
 
 
 def heading_deg(cells: np.ndarray) -> np.ndarray:

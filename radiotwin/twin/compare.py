@@ -164,7 +164,7 @@ def compare_models(train: Measurements, test: Measurements, scene: Scene,
                            "rename it, or give it from another folder")
     for twin in (twins or {}).values():
         twin.require_map(scene)  # before the fits, which take long
-    job = Job("comparing models", with_pieces(partial(_fit_model, train, scene, seed)),
+    job = Job("comparing models", with_pieces(partial(fit_twin, train, scene, seed=seed)),
               Resources(WORKER_BYTES, False))
     fitted = dict(zip(models, (executor or Executor()).run(job, models), strict=True))
     fitted |= twins or {}
@@ -189,11 +189,6 @@ def compare_models(train: Measurements, test: Measurements, scene: Scene,
         assert truth is not None  # maps are scored on the truth map only
         scores += score_map(name, candidate, truth)
     return Comparison(pd.DataFrame(scores), pd.DataFrame(locations), fitted, predictions)
-
-
-def _fit_model(train: Measurements, scene: Scene, seed: int, model: str) -> Twin:
-    """Fit a twin with a channel model, in a worker of `compare_models`."""
-    return fit_twin(train, scene, model=model, seed=seed)
 
 
 def _check(test: Measurements, scene: Scene, truth: RadioMap | None,

@@ -11,6 +11,7 @@ import numpy as np
 from radiotwin.inference.gaussian import Limit, limits_of, mean_if_detected
 from radiotwin.inference.held_out import deal_groups
 from radiotwin.links import LinkGeometry
+from radiotwin.links.variables import ground_squares
 from radiotwin.propagation.laws import channel_named, fit_once
 from radiotwin.propagation.laws.base import BLOCK_M, MIN_DETECTED, ground_blocks
 
@@ -56,8 +57,7 @@ class HeldOut:
             limit_db = limit_db[rows] if isinstance(limit_db, np.ndarray) else limit_db
         by, group = "flight", flight
         if len(np.unique(flight)) < MIN_FLIGHTS:
-            square = np.floor(links.receiver_m[:, :2] / BLOCK_M).astype(np.int64)
-            by, group = "block", np.unique(square, axis=0, return_inverse=True)[1].ravel()
+            by, group = "block", ground_squares(links.receiver_m, BLOCK_M)
         fold = deal_groups(group, FOLDS, rng)
         detected, limits_db = np.isfinite(level_db), limits_of(limit_db, len(level_db))
         if len(np.unique(fold)) < 2 or min(
@@ -119,7 +119,6 @@ class HeldOut:
         return (f"{text} {self.best} would be better: {self.rmse_db[self.best]:.2f} dB, where "
                 f"{model} has {self.rmse_db[model]:.2f} dB; take --model {self.best}, or --model "
                 f"{AUTO}")
-
 
 
 def standard_error(value: np.ndarray, block: np.ndarray) -> float:

@@ -344,6 +344,12 @@ def _fitted(record: FittedRecord, channel: ChannelModel, devices: list[TwinDevic
         raise ValueError("arrays beside the channel belong to nothing")
     if record.blend is not None:
         blend = Blend.from_state(beside, record.blend, len(devices))
+    unheard = None
+    if record.unheard is not None:
+        unheard = Unheard(tuple(record.unheard.devices), record.unheard.mean_db,
+                          record.unheard.sd_db)
+        if max(unheard.devices) >= len(devices):
+            raise ValueError(f"there is no device of index {max(unheard.devices)}")
     _check_terms(effects, coefficients, [device.device for device in devices], record.receivers)
     return FittedModel(channel, tuple(effects), tuple(coefficients),
                        np.array(record.level_coefficients), np.array(record.scale_db), record.dof,
@@ -352,16 +358,7 @@ def _fitted(record: FittedRecord, channel: ChannelModel, devices: list[TwinDevic
                        record.device_sd_db, record.likelihood_power, shadowing,
                        record.radius_factor,
                        np.nan if record.typical_misfit is None else record.typical_misfit, blend,
-                       _unheard(record.unheard, len(devices)))
-
-
-def _unheard(record: UnheardRecord | None, devices: int) -> Unheard | None:
-    """Restore `Unheard` (offsets of devices without a reading), after checking device rows."""
-    if record is None:
-        return None
-    if max(record.devices) >= devices:
-        raise ValueError(f"there is no device of index {max(record.devices)}")
-    return Unheard(tuple(record.devices), record.mean_db, record.sd_db)
+                       unheard)
 
 
 def _check_terms(effects: list[Effect], coefficients: list[np.ndarray], devices: list[str],

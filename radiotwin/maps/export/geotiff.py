@@ -101,9 +101,8 @@ def _write_parts(radio_map: RadioMap | MapStream, path: Path, profile: dict[str,
 def require_rasterio(path: Path) -> Any:
     """Import rasterio; raise BadInput that names the file to write if it is not installed."""
     return optional_package(
-        "rasterio", f"{path}: GeoTIFF is written with the package rasterio, which is not "
-                    "installed; install it with `pip install 'radiotwin[gis]'`, or write .nc or "
-                    ".csv")
+        "rasterio", f"{path} is written with the package rasterio, which is not installed; install "
+                    "it with `pip install 'radiotwin[gis]'`, or write .nc or .csv")
 
 
 def require_origin(scene: Scene, purpose: str) -> Origin:

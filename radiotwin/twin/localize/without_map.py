@@ -134,7 +134,8 @@ def fit_elsewhere(model: FittedModel, device_links: Links, positions_m: np.ndarr
     # Effects refer to devices by their rows in the model, so candidates are appended to these.
     repeated = device_links.select(np.tile(np.arange(n), cells)).of_devices(
         known + np.repeat(np.arange(cells), n), np.vstack([model.device_m, candidates_m]),
-        [f"device {i}" for i in range(known + cells)], frozenset()).with_first_time(model.first_s)
+        [f"device {i}" for i in range(known + cells)], frozenset())
+    repeated = repeated.with_ends(flown=replace(repeated.ends.flown, first_s=model.first_s))
     return model.on_links(repeated)
 
 

@@ -26,7 +26,7 @@ from radiotwin.inference.censored_regression import (
 )
 from radiotwin.inference.student import NO_LOSSES, Losses, ReadingLaw, sd_of_scale
 from radiotwin.links import Links
-from radiotwin.links.links import Prediction
+from radiotwin.links.links import FromPart, Prediction
 from radiotwin.propagation.laws import ChannelModel
 from radiotwin.scene.citymap import CityMap
 from radiotwin.twin.model.blend import Blend
@@ -208,6 +208,8 @@ class Model:
 class Fit(FitResult):
     """A model with the coefficients, error scales and objective of its fit to the training links.
 
+    Some attributes of the model are also those of the fit: `fit.links`.
+
     Attributes:
         model: the model.
         shadowing: interpolation of its residuals over the ground; None: none.
@@ -216,30 +218,11 @@ class Fit(FitResult):
     model: Model
     shadowing: CorrelatedShadowing | None = None
 
-    @property
-    def links(self) -> Links:
-        """Return all n links of the model, training links or not."""
-        return self.model.links
-
-    @property
-    def train(self) -> np.ndarray:
-        """Return (n,) bool, the training links."""
-        return self.model.train
-
-    @property
-    def usable(self) -> np.ndarray:
-        """Return (n,) bool, links to devices that have a position."""
-        return self.model.usable
-
-    @property
-    def channel(self) -> ChannelModel:
-        """Return the channel, as fitted before the effects."""
-        return self.model.channel
-
-    @property
-    def effects(self) -> tuple[Effect, ...]:
-        """Return the effects of the model."""
-        return self.model.effects
+    links = FromPart[Links]("model")
+    train = FromPart[np.ndarray]("model")
+    usable = FromPart[np.ndarray]("model")
+    channel = FromPart[ChannelModel]("model")
+    effects = FromPart[tuple[Effect, ...]]("model")
 
     @property
     def view(self) -> ResidualView:
