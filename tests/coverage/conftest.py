@@ -43,14 +43,12 @@ def write_scene(folder, shapes=(), devices=(), half_m=500.0, ground_z_m=lambda x
 
 
 def make_twin(devices, exponent=2.0, intercept_db=FREE_SPACE_AT_1_M_DB, sd_db=1e-6, level="gain_db"):
-    """Return a twin of declared devices with the law intercept - 10 exponent log10(d)."""
     return Twin(FittedModel.of_channel(LogDistance(LogDistanceLine(intercept_db, exponent, sd_db))),
                 [TwinDevice.anchor(*device) for device in devices], level, None)
 
 
 @pytest.fixture
 def build(tmp_path):
-    """`build(...)` is `write_scene` into a folder of the test."""
     return lambda *shapes, **options: write_scene(tmp_path / "scene", shapes, **options)
 
 
@@ -60,7 +58,6 @@ def twin_of():
 
 
 def box(x_min, y_min, x_max, y_max, height):
-    """A closed box on the ground, faces outwards."""
     mesh = trimesh.creation.box(bounds=[[x_min, y_min, 0], [x_max, y_max, height]])
     return trimesh.Trimesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), process=False)
 

@@ -105,7 +105,6 @@ def test_antennas_at_both_ends_act_on_each_path(plain, has_map):
 
 
 def test_positions_that_are_tried_are_heard_through_both_antennas(plain):
-    """Two devices at one place, of which one has an antenna; receivers have one, too."""
     receiver_m = points(60.0)
     azimuth_deg, paths = rays_by_hand(receiver_m)
     declared = Declared((Radio(antenna=antenna_of(downtilted_sector_dbi)), Radio()), FREQUENCY_HZ, False, antenna_of(dipole_dbi))

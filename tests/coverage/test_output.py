@@ -27,17 +27,17 @@ from radiotwin.coverage.output import (
 from radiotwin.errors import BadInput
 from radiotwin.geo import to_geographic
 from radiotwin.report import write_coverage_pictures
-from radiotwin.report.labels import attribution
 from radiotwin.scene import Scene
+from tests.coverage.conftest import box, write_scene
 
 
-@pytest.fixture
-def scene(build, house):
-    return build(house(100, 100, 300, 200, 20), devices=[("west", -200.0, 0.0, 30.0), ("east", 350.0, 30.0, 30.0)],
-                 half_m=400.0)
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_scene(tmp_path_factory.mktemp("scene") / "house", [box(100, 100, 300, 200, 20)],
+                       [("west", -200.0, 0.0, 30.0), ("east", 350.0, 30.0, 30.0)], 400.0)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def coverage(scene):
     return predict_coverage("p1411", scene, settings=CoverageSettings(step_m=10.0, classes_dbm=(-60.0, -70.0, -80.0)))
 
@@ -145,7 +145,7 @@ def test_classes_begin_at_their_lower_end(coverage):
     assert legend.classes(values).tolist() == [0, 0, 1, 2, 3, -1]
 
 
-def test_without_an_origin_there_is_no_globe(coverage, scene, tmp_path):
+def test_without_an_origin_there_is_no_globe_and_without_rasterio_no_raster(coverage, scene, tmp_path, monkeypatch):
     local = Scene(scene.folder, scene.config.model_copy(update={"origin": None}))
     formats, notes = available_formats(local, None)
     assert formats == ["nc", "tif", "gpkg", "png"] and len(notes) == 1 and "has no [origin]" in notes[0]
@@ -159,16 +159,6 @@ def test_without_an_origin_there_is_no_globe(coverage, scene, tmp_path):
     meta, _, shapes, _ = pyogrio.raw.read(tmp_path / "coverage.gpkg", layer="sinr")
     assert meta["crs"] is None or "Undefined" in meta["crs"]
     assert shapely.union_all(shapely.from_wkb(shapes)).bounds == (-400, -400, 400, 400)
-
-
-def test_a_missing_package_is_told(scene, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "rasterio", None)
-    formats, notes = available_formats(scene, None)
-    assert not {"gpkg", "tif"} & set(formats)
-    assert any("rasterio" in note and "pip install 'radiotwin[gis]'" in note for note in notes)
-
-
-def test_maps_of_openstreetmap_are_credited(scene):
-    assert attribution(scene) == ""
-    of_osm = scene.config.model_copy(update={"provenance": {"source": "data/town.osm.pbf"}})
-    assert attribution(Scene(scene.folder, of_osm)) == "© OpenStreetMap contributors (ODbL)"
+    formats, notes = available_formats(local, None)
+    assert formats == ["nc", "png"] and all("rasterio" in note and "'radiotwin[gis]'" in note for note in notes[:2])

@@ -1,7 +1,6 @@
 """Coverage of worlds whose shares are known from geometry."""
 
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ from radiotwin.coverage import CoverageSettings, Transmitter, predict_coverage
 from radiotwin.coverage.areas import Area, CoverageGrid, _covered_shares, with_ground_as_terrain
 from radiotwin.errors import BadInput
 from radiotwin.maps.radiomap import RadioMap
-from radiotwin.report import coverage_figures
 from radiotwin.scene.antennas import Antenna, Pattern
 from radiotwin.scene.lattice import Lattice
 from tests.coverage.conftest import FREE_SPACE_AT_1_M_DB, write_scene
@@ -27,7 +25,6 @@ def power_at(coverage, x_m, y_m, name="received_power_dbm"):
 
 
 def test_free_space_covers_a_disc(build, twin_of):
-    """Received power reaches the threshold within the radius that Friis' equation gives."""
     devices = [("a", 40.0, -30.0, 31.5)]
     scene = build(devices=devices)
     threshold_dbm = 30.0 + FREE_SPACE_AT_1_M_DB - 20 * math.log10(300.0)
@@ -79,18 +76,7 @@ def test_sinr_between_two_equal_transmitters_is_minus_the_load(build, twin_of, l
     assert power_at(coverage, -5, 0, "best_server") == 0 and power_at(coverage, 5, 0, "best_server") == 1
 
 
-def test_transmitters_of_other_frequencies_do_not_interfere(build, twin_of):
-    scene = build(devices=[("a", -200.0, 0.0, 10.0)])
-    pair = [Transmitter("a", np.array([-200.0, 0, 10]), 60.0, load=1.0, frequency_hz=2.0e9),
-            Transmitter("b", np.array([200.0, 0, 10]), 60.0, load=1.0, frequency_hz=2.1e9)]
-    coverage = predict_coverage("al_hourani_urban", scene, pair, CoverageSettings(step_m=20.0))
-    np.testing.assert_allclose(coverage.dataset["sinr_db"], coverage.dataset["snr_db"], atol=1e-5)
-    assert coverage.summary["model"].startswith("al_hourani_urban (Al-Hourani")
-    with pytest.raises(BadInput, match="the radio's frequency is 28 GHz"):
-        predict_coverage("cost231_wi", scene, [Transmitter("a", np.array([0, 0, 9.0]), 1.0, frequency_hz=28e9)])
-
-
-@pytest.mark.parametrize(("apart_hz", "share"), [(0.0, 1.0), (1e3, 1 - 5e-5), (5e6, 0.75), (20e6, 10**-4.5), (60e6, 0.0)])
+@pytest.mark.parametrize(("apart_hz", "share"), [(0.0, 1.0), (5e6, 0.75), (60e6, 0.0)])
 def test_of_overlapping_channels_the_common_part_interferes(build, apart_hz, share):
     """Free space by hand (ITU-R P.525) at a mast's line of sight, and the share of the two bands that overlaps."""
     scene = build()
@@ -104,6 +90,7 @@ def test_of_overlapping_channels_the_common_part_interferes(build, apart_hz, sha
     sinr_db = 40 - loss_db[1] - 10 * math.log10(noise_mw + share * 10 ** ((40 - loss_db[0]) / 10))
     assert power_at(coverage, 5, 5, "best_server") == 1
     assert power_at(coverage, 5, 5, "sinr_db") == pytest.approx(sinr_db, abs=0.02)
+    assert any("overlap in part" in note for note in coverage.summary["notes"]) == (apart_hz == 5e6)
 
 
 def test_noise_follows_bandwidth_and_noise_figure(build, twin_of):
@@ -113,21 +100,6 @@ def test_noise_follows_bandwidth_and_noise_figure(build, twin_of):
     assert wide.dataset.attrs["noise_dbm"] == pytest.approx(-95.0 + 10 * math.log10(4), abs=1e-6)
     own = predict_coverage(twin_of(devices), scene, settings=CoverageSettings(step_m=100.0, noise_figure_db=5.0))
     assert own.dataset.attrs["noise_dbm"] == pytest.approx(-173.98 + 70 + 5, abs=0.01)
-
-
-def test_share_of_a_polygon(build, twin_of):
-    """A strip of 100 m that the edge of a disc of 300 m cuts far from its middle."""
-    devices = [("a", 0.0, 0.0, 1.5)]
-    scene = build(devices=devices)
-    threshold_dbm = 30.0 + FREE_SPACE_AT_1_M_DB - 20 * math.log10(300.0)
-    strip = Area("strip", shapely.box(0.0, -50.0, 500.0, 50.0))
-    coverage = predict_coverage(twin_of(devices), scene, areas=[strip],
-                                settings=CoverageSettings(step_m=2.0, threshold_dbm=threshold_dbm))
-    inside_m2 = strip.outline.intersection(shapely.Point(0, 0).buffer(300.0, quad_segs=100)).area
-    assert share_at(coverage, threshold_dbm, 1) == pytest.approx(inside_m2 / 50_000.0, rel=0.003)
-    with pytest.raises(BadInput, match="'far': no cell's middle lies in it"):
-        predict_coverage(twin_of(devices), scene, areas=[Area("far", shapely.box(900, 0, 950, 9))],
-                         settings=CoverageSettings(step_m=50.0))
 
 
 def test_cells_in_buildings_are_left_out_or_lose_the_entry_loss(build, twin_of, house):
@@ -289,6 +261,11 @@ def test_what_cannot_be_predicted_is_refused(build, twin_of, house):
         predict_coverage(twin, scene, settings=CoverageSettings(tx_power_dbm=1.0, step_m=0.1))
     with pytest.raises(BadInput, match="device 'x' is not among the transmitters; there are a"):
         predict_coverage(twin, scene, devices=["x"])
+    with pytest.raises(BadInput, match="the radio's frequency is 28 GHz"):
+        predict_coverage("cost231_wi", scene, [Transmitter("a", np.array([50, 0, 9.0]), 1.0, frequency_hz=28e9)])
+    with pytest.raises(BadInput, match="'far': no cell's middle lies in it"):
+        predict_coverage(twin, scene, areas=[Area("far", shapely.box(900, 0, 950, 9))],
+                         settings=CoverageSettings(tx_power_dbm=1.0, step_m=50.0))
 
 
 @pytest.mark.parametrize(("setting", "message"), [
@@ -308,7 +285,6 @@ def test_a_noise_power_below_the_thermal_one(build, twin_of):
 
 
 def test_without_a_gain_indoors_there_is_nothing_to_take_a_loss_off(build, house):
-    """No path goes into a building; shares counted all of it as not covered."""
     scene = build(house(100, 100, 300, 200, 20), devices=[("a", -200.0, 0.0, 30.0)])
     settings = CoverageSettings(step_m=50.0, indoor_loss_db=15.0)
     with pytest.raises(BadInput, match="goes into a building"):
@@ -320,11 +296,3 @@ def test_of_a_power_without_a_deviation_nothing_is_certain():
     found = _covered_shares(power_dbm, sd_db, -85.0, 0.95)
     assert found["share"] == pytest.approx(2 / 3) and found["share_reliable"] == found["mean_probability"] == 0.5
     assert set(_covered_shares(power_dbm[1:2], sd_db[1:2], -85.0, 0.95)) == {"threshold", "share"}
-
-
-@pytest.mark.parametrize("width_m", [50.0, 500.0, 499.99999999999994, 5000.0, 123.4])
-def test_a_scale_bar_is_about_a_fifth_of_the_width(width_m):
-    drawn = []
-    axes = SimpleNamespace(add_patch=lambda patch: drawn.append(patch.get_width()), annotate=lambda *_, **__: None)
-    coverage_figures._draw_scale_bar(axes, (12.8, 12.8 + width_m, 0.0, 20.0))
-    assert width_m / 15 < drawn[0] <= width_m / 5 * (1 + 1e-9)

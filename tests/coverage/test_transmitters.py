@@ -4,8 +4,6 @@ import pytest
 from radiotwin.coverage import CoverageSettings, predict_coverage
 from radiotwin.coverage.transmitters import (
     read_transmitters,
-    scene_transmitters,
-    select,
     with_powers,
 )
 from radiotwin.errors import BadInput
@@ -44,12 +42,6 @@ def test_every_column_is_read(scene, tmp_path):
     assert with_powers([second], scene, None)[0].tx_power_dbm == 30.0  # the scene's
 
 
-def test_positions_on_the_globe(scene, tmp_path):
-    longitude, latitude = to_geographic(scene.config.origin, [100.0], [-50.0])
-    path = written(tmp_path, f"device,latitude_deg,longitude_deg,z_m\ns1,{latitude[0]:.9f},{longitude[0]:.9f},5\n")
-    np.testing.assert_allclose(read_transmitters(path, scene)[0].position_m, [100, -50, 5], atol=1e-3)
-
-
 def test_positions_of_another_frame(scene, tmp_path):
     other = Origin(latitude_deg=47.501, longitude_deg=8.7)
     write_frame(other, tmp_path / "frame.toml")
@@ -63,12 +55,6 @@ def test_a_table_of_devices_is_one(scene, tmp_path):
     with pytest.warns(UserWarning, match="no column antenna names the file"):
         (found,) = read_transmitters(path, scene)
     assert found.position_m.tolist() == [1, 2, 3] and found.antenna is None
-
-
-def test_those_of_the_scene(scene):
-    (found,) = scene_transmitters(scene)
-    assert found.name == "a" and found.tx_power_dbm is None and found.position_m.tolist() == [0, 0, 10]
-    assert select([found], ["a"]) == [found] == select([found], None)
 
 
 @pytest.mark.parametrize(("text", "message"), [

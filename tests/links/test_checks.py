@@ -17,7 +17,6 @@ from tests.terrains import terrain_map
 
 
 def readings(seed, step_db, highest_db=np.inf, n=900):
-    """Return levels of two receivers, the second of which reads no more than some level."""
     rng = np.random.default_rng(seed)
     receiver = rng.integers(0, 2, n)
     level_db = rng.normal(-85, 10, n)
@@ -76,7 +75,6 @@ FLIGHT_M = np.column_stack([np.linspace(-100, 100, 50), np.zeros(50), np.linspac
 
 
 def scene(altitude_m=0.0, ground_m=0.0):
-    """A plane at a height above the datum, which has an altitude."""
     city = SimpleNamespace(ground_height_m=lambda x_m, y_m: np.full(np.shape(x_m), ground_m))
     return SimpleNamespace(city=city, config=SimpleNamespace(
         origin=Origin(latitude_deg=48, longitude_deg=11, altitude_m=altitude_m)))
@@ -102,7 +100,6 @@ def test_plausible_or_unknown_heights_are_not_mentioned(points_m):
 
 
 def test_a_device_whose_height_is_not_given_is_held_above_the_ground():
-    """One of unknown position above most of the ground that was flown over, and not below it."""
     city = terrain_map(lambda x_m, y_m: np.where(x_m > 300.0, 160.0, 100.0) + 0 * y_m)
     world = SimpleNamespace(city=city, device_antennas=[], uav_antenna=None, config=SimpleNamespace(origin=None, devices=[], gain_limit_db=-150.0,
                                                               radio=SimpleNamespace(frequency_hz=2e9, sensitivity_dbm=-120.0)))

@@ -12,11 +12,9 @@ from radiotwin.links import (
     evidence_blocks,
     places,
     prepare_links,
-    residual_variables,
     with_evidence,
 )
 from radiotwin.links.evidence import thin_links, thin_piles
-from radiotwin.links.links import clocks_restart
 from tests.worlds import synthetic_links
 
 
@@ -119,14 +117,6 @@ def test_three_places_at_which_a_receiver_hovers_have_folds():
     assert len(np.unique(evidence_blocks(with_evidence(links, links.level_db)))) == 9  # three places, three devices
 
 
-@pytest.mark.parametrize("restart", [False, True])
-def test_clocks_that_restart_in_each_flight_are_noticed(restart):
-    links = flown(4, 30.0, restart=restart)
-    assert links.time_restarts == restart and clocks_restart(links.tracks) == restart
-    assert np.isnan(residual_variables(links, links.level_db)["time_s"]).all() == restart
-    assert links.select(links.flight < 1).time_restarts == restart  # stays that of all the data
-
-
 @pytest.fixture
 def small_sample(monkeypatch):
     monkeypatch.setattr(evidence, "MAX_LINKS", 1000)
@@ -165,15 +155,6 @@ def test_a_sample_is_drawn_by_the_seed_without_repetition(links, small_sample):
     first, again, other = (thin_links(numbered, seed).quality for seed in (0, 0, 1))
     assert (first == again).all() and (np.diff(first) > 0).all()
     assert not np.array_equal(first, other)
-
-
-def test_no_position_in_time_is_preferred(links, small_sample):
-    """Rationale: every k-th link would always be of the same part of a regular flight."""
-    numbered = links.with_columns(quality=np.arange(float(len(links))))
-    drawn = np.concatenate([thin_links(numbered, seed).quality for seed in range(200)]).astype(int)
-    often = np.bincount(drawn, minlength=len(links)) / 200
-    assert often.mean() == pytest.approx(500 / len(links))
-    assert np.abs(often - often.mean()).max() < 0.25 and often.min() > 0
 
 
 @pytest.mark.seconds

@@ -43,7 +43,6 @@ def fly(seed, limits_db=(-110.0, -110.0), n=4000, soft_db=0.0, lost=0.0, step_db
 
 
 def estimated(links, declared_db=None):
-    """Return limits of receivers, and notes."""
     limit_db, notes = estimate_limits(links, declared_db)
     return links.with_columns(limit_db=limit_db).receiver_limits_db, notes
 
@@ -119,7 +118,6 @@ def test_the_uncertainty_covers_the_error_as_often_as_it_says():
 
 
 def test_effects_must_explain_a_deaf_receiver_and_lost_links_only():
-    """Three receivers that hardly differ keep their limits; the one that stands out gets the usual one."""
     links = fly(1, (-112.0, -110.0, -111.0, -95.0), n=6000)
     links = links.with_columns(limit_db=estimate_limits(links, None)[0])
     before_db, after_db = links.receiver_limits_db, with_usual_limits(links).receiver_limits_db

@@ -86,16 +86,6 @@ def test_every_reader_refuses_a_column_that_is_nearly_known(reader, scene, tmp_p
         read(written(tmp_path / "sites.csv", end, first, "azimutth_deg"), scene)
 
 
-@pytest.mark.parametrize("reader", ["import --devices", "import --receivers"])
-def test_rows_that_no_reading_is_of_are_said(reader, scene, tmp_path):
-    end, first, read = READERS[reader]
-    rng = np.random.default_rng(6)
-    for _ in range(5):
-        name = "".join(rng.choice(LETTERS, rng.integers(3, 15)))
-        notes = read(written(tmp_path / "sites.csv", end, first, row=name), scene)
-        assert f"sites.csv: 1 of 2 names occur in no row of the log: {name}" in notes
-
-
 def test_sheets_that_are_not_read_are_said(tmp_path):
     openpyxl = pytest.importorskip("openpyxl")
     book = openpyxl.Workbook()

@@ -11,7 +11,6 @@ from radiotwin.links.correlation import Trend, Variogram, pairs_of_links
 
 
 def tracks(seed, flights=4, slots=80, side_m=400.0):
-    """Straight flights over a square, past one device."""
     rng = np.random.default_rng(seed)
     ends = rng.uniform(0, side_m, (flights, 2, 2))
     share = np.linspace(0, 1, slots)[:, None]
@@ -40,13 +39,6 @@ def test_some_links_stand_for_many(monkeypatch):
     exact = Trend.semivariances(trend, place_m, i, i + 9, np.array([10.0, 100.0]))
     monkeypatch.setattr(variogram, "NODES", 10_000)
     np.testing.assert_allclose(exact, trend.semivariances(place_m, i, i + 9, np.array([10.0, 100.0])), atol=0.02)
-
-
-def test_levels_of_flights_and_trends_are_nothing_of_a_residual():
-    _, links, series = tracks(2)
-    trend = Trend.of(links, np.arange(len(series)), series)
-    common = 5.0 * series + 3.0 * np.log(links.distance_m) - 2.0 * np.cos(np.radians(links.azimuth_deg))
-    np.testing.assert_allclose(trend.detrended(common), 0.0, atol=1e-9)
 
 
 @pytest.mark.seconds

@@ -47,7 +47,6 @@ print(peak_bytes() - before)
 
 
 def make(folder, small_scene, devices, step_m):
-    """Write a scene's folder with a fine lattice, and a map over it in both formats; return its bytes."""
     shutil.copytree(small_scene.folder, folder / "scene", ignore=shutil.ignore_patterns("cache", "truth*"))
     toml = folder / "scene" / "scene.toml"
     toml.write_text(toml.read_text().replace("step_m = 20.0", f"step_m = {step_m}"))

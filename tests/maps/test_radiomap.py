@@ -27,19 +27,6 @@ def test_a_map_whose_name_is_in_capitals(tmp_path):
         assert radio_map.devices == ["a", "bé"]
 
 
-def test_values_lie_where_the_lattice_says():
-    radio_map = small_map()
-    value = radio_map.dataset["gain_db"].sel(device="bé", x=40, y=0, z=60).item()
-    index = LATTICE.index_of(np.array([[40.0, 0.0, 60.0]]))[0]
-    assert value == radio_map.gain_db[1].ravel()[index] == -(12 + index)
-
-
-def test_units_are_in_the_file(tmp_path):
-    small_map().save(tmp_path / "map.nc")
-    with xr.open_dataset(tmp_path / "map.nc", engine="h5netcdf") as dataset:
-        assert dataset["gain_db"].attrs["units"] == "dB" and dataset["x"].attrs["units"] == "m"
-
-
 def test_what_is_not_a_radio_map_is_bad_input(tmp_path):
     with pytest.raises(BadInput, match="does not exist"):
         RadioMap.load(tmp_path / "no.nc")

@@ -50,7 +50,6 @@ def write_sector(path):
 
 
 def truth_db(device_m, receiver_m, boresight_deg=None):
-    """Gain by the exponent, through a sector with that boresight if there is one."""
     east, north, up = (np.asarray(receiver_m) - device_m).T
     gain_db = A_DB - 10 * EXPONENT * np.log10(np.sqrt(east**2 + north**2 + up**2))
     if boresight_deg is None:
@@ -78,12 +77,10 @@ def campaign(folder, devices, column="rssi_dbm", boresights_deg=None, seed=0, li
 
 
 def powered(folder, powers_dbm, **settings):
-    """A campaign of devices (name -> declared transmit power [dBm])."""
     return campaign(folder, {name: {"tx_power_dbm": power, "adds_db": power} for name, power in powers_dbm.items()}, **settings)
 
 
 def at_points(grid, height_m=40.0):
-    """Points (n, 3) of a grid, as maps are raveled [m]."""
     x_m, y_m = (axis.ravel() for axis in np.meshgrid(grid.x_m, grid.y_m))
     return np.column_stack([x_m, y_m, np.full(len(x_m), height_m)])
 
@@ -95,7 +92,6 @@ def predicted_db(twin, scene, names, at_m):
 
 @pytest.fixture(scope="module")
 def ground(tmp_path_factory):
-    """Open ground whose scene declares no power."""
     return write_scene(tmp_path_factory.mktemp("open") / "scene", tx_power_dbm=0.0, noise_dbm=-102.0)
 
 

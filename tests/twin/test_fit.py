@@ -13,17 +13,10 @@ from radiotwin.twin import Twin, fit, fit_twin
 
 
 def test_positions_of_unknown_devices_are_not_read(small_scene, flown, twin):
-    """A file may hold them; a twin that was learnt from them would be worth nothing."""
     wrong = flown.devices.copy()
     wrong.loc[wrong["role"] == "unknown", ["x_m", "y_m"]] = 7.0
     again = fit_twin(Measurements(flown.table, wrong), small_scene, model="segmented_log_distance", seed=0)
     assert again.devices == twin.devices
-
-
-def test_levels_that_say_nothing_are_refused(small_scene, flown):
-    constant = Measurements(flown.table.assign(gain_db=-80.0), flown.devices)
-    with pytest.raises(BadInput, match="all levels are -80, so there is nothing to explain"):
-        fit_twin(constant, small_scene, model="log_distance")
 
 
 def test_copies_of_links_are_left_out(small_scene, flown):
@@ -31,12 +24,6 @@ def test_copies_of_links_are_left_out(small_scene, flown):
     with pytest.warns(UserWarning, match="links left out: they are in the file twice"):
         again = fit_twin(twice, small_scene, model="log_distance", seed=0)
     assert again.devices == fit_twin(flown, small_scene, model="log_distance", seed=0).devices
-
-
-def test_anchors_keep_their_positions(flown, twin):
-    for device, declared_m in zip(twin.devices, flown.device_m):
-        if device.role == "anchor":
-            assert (device.x_m, device.y_m, device.z_m) == tuple(declared_m) and device.credible_radius_m == 0
 
 
 def test_a_device_never_measured_is_reported_not_guessed(small_scene, flown, tmp_path):
@@ -50,28 +37,12 @@ def test_a_device_never_measured_is_reported_not_guessed(small_scene, flown, tmp
     assert np.isnan(again.x_m) and again.credible_radius_m == np.inf
 
 
-def test_a_level_in_dbm_is_turned_into_gain_by_the_transmit_power(small_scene, flown, twin):
-    """RSSI with 20 dBm transmitted is 20 dB above the gain; the map must be the same."""
-    radio = small_scene.config.radio.model_copy(update={"tx_power_dbm": 20.0, "sensitivity_dbm": -100.0})
-    loud = Scene(small_scene.folder, small_scene.config.model_copy(update={"radio": radio}))
-    table = flown.table.assign(rssi_dbm=flown.table["gain_db"] + 20).drop(columns="gain_db")
-    again = fit_twin(Measurements(table, flown.devices), loud, model="segmented_log_distance", seed=0)
-    assert again.level == "rssi_dbm"
-    np.testing.assert_allclose(again.radio_map(loud).gain_db, twin.radio_map(small_scene).gain_db, atol=0.02)
-
-
-def test_a_missing_height_is_bad_input(small_scene, flown):
-    table = flown.table.copy()
-    table.loc[4, "receiver_z_m"] = np.nan
-    with pytest.raises(BadInput, match="measurements, row 6, column receiver_z_m"):
-        fit_twin(Measurements(table, flown.devices), small_scene, model="segmented_log_distance", seed=0)
-
-
-def test_an_anchor_inside_a_building_is_bad_input(small_scene, flown):
-    devices = flown.devices.copy()
-    devices.loc[0, ["x_m", "y_m"]] = 130.0, 170.0
-    with pytest.raises(BadInput, match="devices, row 2: anchor 'd0' .*inside a building"):
-        fit_twin(Measurements(flown.table, devices), small_scene, model="segmented_log_distance", seed=0)
+def test_a_spare_device_without_a_height_is_no_reason_to_fit_nothing(small_scene, flown):
+    spare = pd.DataFrame([{"device": "spare", "x_m": np.nan, "y_m": np.nan, "z_m": np.nan, "role": "unknown"}])
+    devices = pd.concat([flown.devices, spare], ignore_index=True)
+    twin = fit_twin(Measurements(flown.table, devices), small_scene, model="log_distance")
+    last = twin.devices[-1]
+    assert last.device == "spare" and not last.located and np.isnan([last.x_m, last.y_m]).all()
 
 
 def test_an_anchor_just_below_a_roof_of_the_map_stands_on_it(small_scene, flown):
@@ -111,15 +82,6 @@ def test_a_twin_of_another_scene_is_warned_of(small_scene, flown, twin):
         fit_twin(flown, other, model="log_distance", seed=0, start=twin)
 
 
-def test_blanks_far_above_the_limit_of_detection_are_warned_of(small_scene, flown):
-    table = flown.table.copy()
-    table.loc[table["gain_db"] < np.nanquantile(table["gain_db"], 0.2), "gain_db"] = np.nan
-    radio = small_scene.config.radio.model_copy(update={"sensitivity_dbm": -150.0})
-    deaf = Scene(small_scene.folder, small_scene.config.model_copy(update={"radio": radio}))
-    with pytest.warns(UserWarning, match="-150 dB .*, is not used: but for odd ones, the weakest of"):
-        fit_twin(Measurements(table, flown.devices), deaf, model="segmented_log_distance", seed=0)
-
-
 def test_of_too_many_links_some_of_each_device_are_drawn(monkeypatch):
     device = np.repeat(["a", "b", "c"], [10, 600, 390])
     table = pd.DataFrame({"device": device, "row": np.arange(1000), "x_m": 0.0, "y_m": 0.0, "gain_db": -80.0})
@@ -135,9 +97,14 @@ def test_of_too_many_links_some_of_each_device_are_drawn(monkeypatch):
         assert fit._thinned(data, 0).table.equals(thin.table)
 
 
-def test_a_spare_device_without_a_height_is_no_reason_to_fit_nothing(small_scene, flown):
-    spare = pd.DataFrame([{"device": "spare", "x_m": np.nan, "y_m": np.nan, "z_m": np.nan, "role": "unknown"}])
-    devices = pd.concat([flown.devices, spare], ignore_index=True)
-    twin = fit_twin(Measurements(flown.table, devices), small_scene, model="log_distance")
-    last = twin.devices[-1]
-    assert last.device == "spare" and not last.located and np.isnan([last.x_m, last.y_m]).all()
+@pytest.mark.parametrize(("change", "message"), [
+    (lambda links, devices: links.update(links.assign(gain_db=-80.0)), "all levels are -80, so there is nothing to explain"),
+    (lambda links, devices: links.__setitem__("receiver_z_m", links["receiver_z_m"].mask(links.index == 4)),
+     "measurements, row 6, column receiver_z_m"),
+    (lambda links, devices: devices.loc.__setitem__((0, ["x_m", "y_m"]), (130.0, 170.0)),
+     "devices, row 2: anchor 'd0' .*inside a building")])
+def test_what_cannot_be_learnt_from_is_refused(small_scene, flown, change, message):
+    links, devices = flown.table.copy(), flown.devices.copy()
+    change(links, devices)
+    with pytest.raises(BadInput, match=message):
+        fit_twin(Measurements(links, devices), small_scene, model="log_distance")

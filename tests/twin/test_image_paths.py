@@ -15,7 +15,6 @@ from radiotwin.twin.localize import Relocation
 
 @pytest.fixture(scope="module")
 def twin(narrow_street, tmp_path_factory):
-    """The twin, loaded from its folder."""
     folder = tmp_path_factory.mktemp("raytraced") / "twin"
     fit_twin(narrow_street.measured, narrow_street.scene, model="paths", seed=0).save(folder)
     return Twin.load(folder)
@@ -58,7 +57,6 @@ def test_an_earlier_twin_saves_most_of_the_search(narrow_street, twin, monkeypat
 
 
 def test_a_map_that_does_not_explain_the_levels_is_warned_of(narrow_street):
-    """In a statistical truth only line of sight is the map's."""
     scene = narrow_street.scene
     flown = fly_survey(scene, segmented_truth(scene), flights=1, pattern="random-waypoint", seed=0, noise_db=0.0)
     anchors = flown.select(flown.is_anchor[flown.device_index])

@@ -49,7 +49,6 @@ def read(name):
 
 
 def document(name):
-    """A twin's record and channel, with few points of shadowing."""
     record, channel = read(name)
     shadowing = record["fitted"]["shadowing"]
     if shadowing:

@@ -33,7 +33,6 @@ def test_saved_and_loaded_it_predicts_the_same(small_scene, flown, tmp_path, mod
 
 
 def assert_equal(one, other):
-    """Check that two predictions are the same to the bit."""
     for name, value in vars(one).items():
         np.testing.assert_array_equal(value, getattr(other, name), err_msg=name)
 

@@ -9,7 +9,6 @@ from radiotwin.scene.lattice import Lattice
 
 @pytest.fixture
 def scene(small_scene):
-    """`preset:small`, placed on the globe."""
     config = small_scene.config.model_dump(by_alias=True) | {"origin": {"latitude_deg": 47.5, "longitude_deg": 8.7}}
     return Scene(small_scene.folder, SceneConfig.model_validate(config))
 

@@ -16,7 +16,6 @@ TRACK_M = np.array([(0, 0, 50), (0, 20, 50), (0, 40, 50), (0, 40, 50), (0, 40, 5
 
 
 def haversine_m(one, other):
-    """Distance on a sphere of the earth's mean radius [m]."""
     (lon_1, lat_1), (lon_2, lat_2) = np.radians(one), np.radians(other)
     h = np.sin((lat_2 - lat_1) / 2)**2 + np.cos(lat_1) * np.cos(lat_2) * np.sin((lon_2 - lon_1) / 2)**2
     return 2 * 6371008.8 * np.arcsin(np.sqrt(h))

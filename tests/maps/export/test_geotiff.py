@@ -52,12 +52,6 @@ def test_uneven_positions_make_no_picture(scene, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_missing_package_names_what_to_install(radio_map, scene, tmp_path, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "rasterio", None)
-    with pytest.raises(BadInput, match=r"pip install 'radiotwin\[gis\]'"):
-        write_geotiff(radio_map, scene, tmp_path / "map.tif")
-
-
 def test_a_large_map_is_written_in_parts(scene, tmp_path, monkeypatch):
     monkeypatch.setattr("radiotwin.maps.export.geotiff._WHOLE_VALUES", 1000)
     monkeypatch.setattr("radiotwin.maps.file.BLOCK_VALUES", 700)

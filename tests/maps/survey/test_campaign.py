@@ -35,13 +35,16 @@ def test_the_statistical_truth_is_the_published_law(small_scene, truth):
         assert residual_db.std() == pytest.approx(sigma, rel=4 / np.sqrt(2 * n))
 
 
-def test_receiver_noise_is_added_to_a_map_of_values(small_scene, truth):
+def test_a_receivers_error_is_added_to_a_map_of_values(small_scene, truth):
+    """It is 1 dB unless another is given; a statistical truth scatters by itself."""
     values = dataclasses.replace(truth, dataset=truth.dataset.drop_vars("sigma_db"))
-    exact, noisy = (survey(small_scene, values, noise_db=noise_db) for noise_db in (-0.0, 3.0))
+    exact, usual, noisy = (survey(small_scene, values, **given) for given in ({"noise_db": -0.0}, {}, {"noise_db": 3.0}))
     index = truth.lattice.index_of(exact.receiver_m)
     expected = truth.gain_db.reshape(len(truth.devices), -1)[exact.device_index, index]
     np.testing.assert_allclose(exact.level_db, expected, atol=6e-4)
-    assert (noisy.level_db - exact.level_db).std() == pytest.approx(3.0, rel=0.1)
+    for found, sd_db in ((usual, 1.0), (noisy, 3.0)):
+        assert (found.level_db - exact.level_db).std() == pytest.approx(sd_db, rel=0.1)
+    assert survey(small_scene, truth).table.equals(survey(small_scene, truth, noise_db=0.0).table)
 
 
 def test_below_sensitivity_is_blank(small_scene, truth):
@@ -146,7 +149,6 @@ def test_devices_are_matched_by_name(small_scene, truth):
 
 
 def test_where_a_receiver_stands_on_a_device_its_gain_is_that_at_one_metre(small_scene):
-    """The logarithm of no distance is infinite."""
     config = small_scene.config
     device = config.devices[0]
     lattice = config.lattice.model_copy(update={"altitudes_m": [device.z_m]})
@@ -156,12 +158,3 @@ def test_where_a_receiver_stands_on_a_device_its_gain_is_that_at_one_metre(small
     found = segmented_truth(scene)
     assert np.isfinite(found.gain_db).all()
     assert found.gain_db[0].max() == pytest.approx(-30.0)  # LoS at 1 m (Chen et al. 2023)
-
-
-def test_a_receivers_error_is_1_db_unless_the_truth_has_its_own(small_scene, truth):
-    """A statistical truth scatters by itself; values of a map do not."""
-    values = dataclasses.replace(truth, dataset=truth.dataset.drop_vars("sigma_db"))
-    for world, sd_db in ((values, 1.0), (truth, 0.0)):
-        exact, usual = (survey(small_scene, world, **given) for given in ({"noise_db": 0.0}, {}))
-        error_db = usual.level_db - exact.level_db
-        assert np.isfinite(error_db).all() and error_db.std() == pytest.approx(sd_db, rel=4 / np.sqrt(2 * len(error_db)))

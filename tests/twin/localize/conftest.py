@@ -23,8 +23,6 @@ class PublishedLaw:
 
 
 class FreeSpace:
-    """A log-distance law that knows no buildings, 2 dB."""
-
     def predict(self, links):
         log_d = np.log10(np.linalg.norm(links.receiver_m - links.device_m, axis=1))
         return -40 - 20 * log_d, np.full(len(log_d), 2.0)
@@ -42,7 +40,6 @@ def blocked(boxes, a, b):
 
 
 def indoors(boxes, xy, z):
-    """(n,) bool"""
     within = (boxes[:, :2] < xy[:, None]) & (xy[:, None] < boxes[:, 2:4])
     return (within.all(axis=2) & (boxes[:, 4] > z)).any(axis=1)
 
@@ -63,7 +60,6 @@ def city(boxes):
 
 @pytest.fixture(scope="session")
 def one_block():
-    """A map with one building, 40 m x 40 m x 30 m around (100, 100)."""
     solid = trimesh.creation.box(bounds=[[80, 80, 0], [120, 120, 30]])
     return CityMap(solid.vertices, solid.faces)
 
@@ -107,8 +103,6 @@ def measured(boxes):
 
 @pytest.fixture(scope="session")
 def on_free_ground(boxes):
-    """Draws n device positions outdoors in the RBM preset."""
-
     def draw(n, rng):
         xy = rng.uniform([0, 0], [600, 800], (20 * n, 2))
         return xy[~indoors(boxes, xy, 1.5)][:n]

@@ -18,7 +18,6 @@ from tests.worlds import RBM
 
 
 def found(twin, name):
-    """Return where a twin has a device [m], and its circle's radius [m]."""
     device = next(each for each in twin.devices if each.device == name)
     return np.array([device.x_m, device.y_m]), device.credible_radius_m
 

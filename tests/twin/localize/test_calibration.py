@@ -16,24 +16,19 @@ AREA_M = (-100.0, 600.0, -100.0, 600.0)
 
 
 def overconfident(scale_db):
-    """Return a model of the open ground that takes errors for so small."""
     channel = LogDistance(LogDistanceLine(-35.0, 2.6, 2.0))
     return FittedModel(channel, (), (), np.zeros(2), np.array([scale_db]), 5.0, np.zeros((5, 3)), ("r0", "r1"), 0.0, 0.0)
 
 
 def folds_of(open_ground, seed, noise_db=6.0, count=4):
-    """Return a few links of every device in each fold."""
     links = prepare_links(open_ground.measured(open_ground.fly(seed, noise_db)), None)
     rng = np.random.default_rng(seed)
     return [links.select(np.sort(rng.choice(len(links), 60, replace=False))) for _ in range(count)]
 
 
-def test_the_factor_is_the_conformal_quantile():
+def test_the_factor_is_the_conformal_quantile_and_few_devices_far_off_widen():
     assert radius_factor(np.arange(1, 20) / 10.0) == pytest.approx(1.8)  # the 18th of 19
     assert radius_factor(np.full(30, 0.2)) == 1.0
-
-
-def test_few_devices_far_off_widen_and_few_that_are_near_do_not():
     assert radius_factor(np.array([3.0, 4.0])) > 2.0 and radius_factor(np.array([0.3, 0.5])) == 1.0
 
 

@@ -8,7 +8,6 @@ BOUNDS = (0.0, 400.0, 0.0, 400.0)
 
 
 def test_equals_the_formula_written_out(free_space):
-    """Levels, repeats with half of the variance drawn anew, and misses, at one position."""
     rng = np.random.default_rng(0)
     places = np.column_stack([rng.uniform(0, 400, (5, 2)), [50.0, 60, 60, 70, 70]])
     receiver_m = places[[0, 1, 1, 2, 3, 3, 4]]

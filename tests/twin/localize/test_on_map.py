@@ -3,6 +3,7 @@ import pytest
 
 from radiotwin.errors import BadInput
 from radiotwin.twin.localize import LocalizeSettings, likelihood, localize, posterior
+from radiotwin.twin.localize.on_map import CONSTRICTION
 
 QUICK = LocalizeSettings(scan_step_m=10.0, swarms=3, particles=8, iterations=12)
 BOUNDS = (0.0, 400.0, 0.0, 400.0)
@@ -79,7 +80,6 @@ def test_repeats_of_independent_noise_average_but_repeats_of_model_error_do_not(
 
 
 def test_one_wrong_link_does_not_outvote_the_others(free_space):
-    """A link that is 40 dB off, 20 sigma, moves the estimate less than the radius."""
     rng = np.random.default_rng(4)
     receiver_m = all_over(60, rng)
     level = free_space_levels((150, 220), receiver_m, rng)
@@ -90,7 +90,6 @@ def test_one_wrong_link_does_not_outvote_the_others(free_space):
 
 
 def test_never_inside_a_building_unless_allowed(one_block, published_law):
-    """The truth is 1 m behind a wall, where the data pull."""
     rng = np.random.default_rng(5)
     receiver_m = np.column_stack([rng.uniform(0, 200, (150, 2)), np.full(150, 60.0)])
     for seed in range(3):
@@ -179,11 +178,14 @@ def test_never_detected_is_not_located(free_space):
 
 
 def test_one_link_is_too_little(free_space):
-    """A single level of a channel so vague that it hardly prefers any position."""
-
     class Vague:
         def predict(self, links):
             return free_space.predict(links)[0], np.full(len(links), 30.0)
 
     estimate = one(np.array([[200.0, 200.0, 60.0]]), np.array([-85.0]), Vague())
     assert not estimate.located
+
+
+def test_constriction():
+    """Clerc and Kennedy's published value for phi = 4.1."""
+    assert np.isclose(CONSTRICTION, 0.7298, atol=1e-4)

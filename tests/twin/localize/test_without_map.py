@@ -17,7 +17,6 @@ AREA_M = (-200.0, 700.0, -200.0, 700.0)
 
 
 def errors_m(model, links, truth_m):
-    """Return distance to the true position and radius of each device."""
     found = locate(model, links, AREA_M)
     true_m = dict(zip(links.device_names, truth_m))
     return np.array([[np.hypot(each.x_m - true_m[each.device][0], each.y_m - true_m[each.device][1]), each.credible_radius_m]
@@ -25,7 +24,6 @@ def errors_m(model, links, truth_m):
 
 
 def few_links(links, rng, count):
-    """Return so many links of every device."""
     rows = [rng.choice(np.flatnonzero(links.device == device), count, replace=False)
             for device in range(len(links.device_names))]
     return links.select(np.concatenate(rows))
@@ -44,13 +42,11 @@ class Counting(LogDistance):
 
 
 def model_of(channel, effects=(), coefficients=(), device_sd_db=0.0):
-    """Return a model that knows three devices."""
     return FittedModel(channel, effects, coefficients, np.zeros(2), np.array([2.0]), 5.0, np.zeros((3, 3)), ("r0", "r1"), 0.0,
                        device_sd_db)
 
 
 def alone(open_ground, seed):
-    """Return 40 links of one device, in a file that lists no other, and its true position."""
     world = open_ground.fly(seed)
     links = prepare_links(open_ground.measured(world), None)
     own = links.select(np.flatnonzero(links.device == 4)[::18])
