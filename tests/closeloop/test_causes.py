@@ -13,14 +13,21 @@ from radiotwin.closeloop.search.scoring import score_model
 from radiotwin.closeloop.search.stages import SearchInputs, SearchState, search
 from radiotwin.closeloop.search.trials import Trial, TrialLog
 from radiotwin.closeloop.verdict import intervals, posterior
+from radiotwin.closeloop.verdict.criteria import SelectionCriteria
 from radiotwin.closeloop.verdict.posterior import Step
-from radiotwin.effects.catalogue.detection_limit import DetectionLimit
-from radiotwin.effects.catalogue.excess_attenuation import ExcessAttenuation
-from radiotwin.effects.catalogue.gain_drift import ReceiverDrift
-from radiotwin.effects.catalogue.gain_offsets import DeviceGainOffset, ReceiverGainOffset
+from radiotwin.effects import registry
+from radiotwin.links import prepare_links
+from radiotwin.links.limits import with_usual_limits
 from tests.closeloop.looking import based
 
 INPUTS = SearchInputs(None, None, None, ())
+LIMIT_DB = -97.0
+
+
+def searched(measured, *effects, **others):
+    """Search lasting causes."""
+    model, inputs = based(measured, *effects, **others)
+    return search(SearchState(model), [add_causes], inputs)
 
 
 def test_an_offset_that_no_fold_has_links_enough_for_is_not_kept(open_ground):
@@ -47,13 +54,12 @@ def with_a_loud_receiver(open_ground, *effects):
     """Search lasting causes where one receiver reads 6 dB too much."""
     world = open_ground.fly(3)
     world.gain_db[world.receiver == 1] += 6.0
-    model, inputs = based(open_ground.measured(world), *effects)
-    return search(SearchState(model), [add_causes], inputs)
+    return searched(open_ground.measured(world), *effects)
 
 
 def test_weaker_candidates_are_scored_if_the_best_one_is_improbable(open_ground, monkeypatch):
     """A receiver that is 6 dB off gains so much that nothing else is scored, unless it is improbable."""
-    effects = ReceiverGainOffset(), DetectionLimit(), ExcessAttenuation(), ReceiverDrift()
+    effects = registry.ReceiverGainOffset(), registry.DetectionLimit(), registry.ExcessAttenuation(), registry.ReceiverDrift()
     found = with_a_loud_receiver(open_ground, *effects)
     assert [each.name for each in found.model.whole.effects][:1] == ["receiver_gain_offset"]
     outdone = {score.name for score in found.log.trials if score.step == 0 and "gains more on" in score.reason}
@@ -83,7 +89,7 @@ def test_an_effect_whose_size_may_be_zero_is_not_named(open_ground, monkeypatch)
         return replace(size_db, low=size_db.value - 20.0, high=size_db.value + 20.0)
 
     monkeypatch.setattr(intervals, "effect_size_db", uncertain)
-    found = with_a_loud_receiver(open_ground, ReceiverGainOffset(), DeviceGainOffset())
+    found = with_a_loud_receiver(open_ground, registry.ReceiverGainOffset(), registry.DeviceGainOffset())
     assert not found.model.whole.effects
     (score, *_) = [each for each in found.log.trials if each.name == "receiver_gain_offset"]
     assert not score.kept and "may show nothing of it: 3.0 dB (-17.0 to 23.0)" in score.reason
@@ -144,3 +150,53 @@ def test_without_a_candidate_there_is_no_step():
     """What is left may depend on variables that have no order, such as flights, of which no curve can be tried."""
     state = SearchState(MODEL, TrialLog().record(Trial("foliage", kept=True, rivals=("interference",))))
     assert forward_selection(state, [], INPUTS) is state
+
+
+@pytest.fixture
+def selected(open_ground):
+    """Function that declares anchors away from where they are, and selects with a probability that is needed."""
+    def run(moved_m, min_probability):
+        world = open_ground.fly(2)
+        for device, east_m in moved_m.items():
+            world.device_m[device, 0] += east_m
+        return searched(open_ground.measured(world), registry.DevicePositionError(), registry.ReceiverGainOffset(),
+                        criteria=SelectionCriteria(min_probability=min_probability))
+    return run
+
+
+def best_alone(result):
+    return max(trial.probability for trial in result.log.trials if trial.probability == trial.probability)
+
+
+def test_two_anchors_of_which_none_is_probable_alone_are_named_together(selected):
+    moved_m = {1: 45.0, 3: -45.0}
+    needed = best_alone(selected(moved_m, 1.0)) + 0.005
+    result = selected(moved_m, needed)
+    assert {each.params.device for each in result.model.whole.effects} == set(moved_m)
+    kept = result.log.kept
+    assert len(kept) == 2 and {trial.reason for trial in kept} == {""}
+    assert all(trial.probability >= needed for trial in kept)
+
+
+@pytest.mark.slow
+def test_one_anchor_has_no_second_beside_it(selected):
+    needed = best_alone(selected({1: 45.0}, 1.0)) + 0.005
+    assert selected({1: 45.0}, needed).model.whole.effects == ()
+
+
+@pytest.mark.parametrize("off_db, limit_moves, named", [
+    (6.0, True, ["receiver_gain_offset"]), (6.0, False, ["receiver_gain_offset"]),
+    (0.0, True, ["noise_floor_censoring"])])
+def test_one_fault_has_one_name(open_ground, off_db, limit_moves, named):
+    """A receiver that reads too much has a limit of detection that is as much higher."""
+    world = open_ground.fly(3)
+    mine = world.receiver == 1
+    limit_db = np.where(mine & limit_moves, LIMIT_DB + 6.0, LIMIT_DB)
+    world.gain_db += np.where(mine, off_db, 0.0)
+    world.gain_db[world.gain_db < limit_db] = np.nan
+    world.limit_db = -np.inf
+    links = with_usual_limits(prepare_links(open_ground.measured(world), None))
+    result = searched(links, registry.ReceiverGainOffset(), registry.DetectionLimit())
+    assert [each.name for each in result.model.whole.effects] == named
+    used_db = [float(np.median(result.model.whole.model.limit_db[links.receiver == receiver])) for receiver in (0, 1)]
+    assert used_db == pytest.approx([LIMIT_DB, LIMIT_DB + 6.0 * limit_moves], abs=1.0)
