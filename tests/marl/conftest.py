@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from marl.mission import Known, Mission, make_mission
 from radiotwin.maps.survey import segmented_truth
+from studies.generated import generated_mission
 
 FAR = 2**60  # moves home from a cell without a way
 STEPS = [(0, 0), (1, 0), (0, -1), (-1, 0), (0, 1), (0, 0)]  # hover, north, west, south, east, no-op: (row, column)
@@ -265,6 +266,12 @@ def corners(tiny):
 def missions():
     """A hypothesis strategy."""
     return any_mission()
+
+
+@pytest.fixture(scope="session")
+def city():
+    """A generated city with 8 devices."""
+    return generated_mission(3, devices=8, side_m=(400.0, 300.0))
 
 
 @pytest.fixture(scope="session")

@@ -8,32 +8,17 @@ import pytest
 
 import marl.replicas
 from marl.fedqmix.federation import average, weighted_mean
-from marl.mission import Known, make_mission
 from marl.qmix import QNetworks, Trainer
 from marl.replicas import Replicas
 from marl.settings import PRESETS
 from radiotwin.errors import RunFailed
-from radiotwin.maps.survey import segmented_truth
 
 SETTINGS = PRESETS["fast"].model_copy(update={"parallel": 4, "batch": 4, "replay": 8, "hidden": 8, "mixing_width": 4})
-
-
-@pytest.fixture(scope="module")
-def mission(small_scene):
-    return make_mission(small_scene, segmented_truth(small_scene), Known.truth(small_scene))
 
 
 def arguments(mission):
     """Of two trainers."""
     return [(QNetworks, SETTINGS, mission, 100, 0, number) for number in range(2)]
-
-
-def trainers(mission, settings=SETTINGS):
-    """Three replicas that have learned different things."""
-    made = [Trainer(QNetworks, settings, mission, 100, 0, number) for number in range(3)]
-    for trainer in made:
-        trainer.train(8)
-    return made
 
 
 def test_the_average_is_the_exact_mean():
@@ -53,9 +38,11 @@ def test_a_mean_counts_the_episodes_behind_each_replica():
     assert weighted_mean(replicas, [0, 2])["a"][0] == 4
 
 
-def test_replicas_share_no_memory_after_averaging(mission):
+def test_replicas_share_no_memory_after_averaging(city_mission):
     # The published code hands the same tensors to all: its replicas are one from the first averaging on.
-    replicas = trainers(mission)
+    replicas = [Trainer(QNetworks, SETTINGS, city_mission, 100, 0, number) for number in range(3)]
+    for replica in replicas:
+        replica.train(8)
     assert any((a != b).any() for a, b in zip(replicas[0].weights().values(), replicas[1].weights().values()))
     mean = average([replica.weights() for replica in replicas])
     for replica in replicas:
@@ -73,18 +60,18 @@ def test_replicas_share_no_memory_after_averaging(mission):
             np.testing.assert_array_equal(weights, before[name])
 
 
-def test_federating_all_averages_moments_and_target_networks(mission):
-    weights = trainers(mission, SETTINGS.model_copy(update={"federate_all": True}))[0].weights()
+def test_federating_all_averages_moments_and_target_networks(city_mission):
+    weights, some = (QNetworks(SETTINGS.model_copy(update={"federate_all": each}), city_mission, 0).weights()
+                     for each in (True, False))
     assert {name.split(".")[0] for name in weights} == {"agent", "mixer", "target_agent", "target_mixer", "mean",
                                                         "square"}
-    some = trainers(mission, SETTINGS.model_copy(update={"federate_all": False}))[0].weights()
     assert {name.split(".")[0] for name in some} == {"agent", "mixer"}
 
 
-def test_processes_learn_the_same_as_this_one(mission, monkeypatch):
+def test_processes_learn_the_same_as_this_one(city_mission, monkeypatch):
     monkeypatch.setattr(marl.replicas, "usable_cores", lambda: 2)
-    here = [Trainer(*each) for each in arguments(mission)]
-    replicas = Replicas(Trainer, arguments(mission))
+    here = [Trainer(*each) for each in arguments(city_mission)]
+    replicas = Replicas(Trainer, arguments(city_mission))
     try:
         records = replicas.call("train", 8)
         assert records == [trainer.train(8) for trainer in here]

@@ -1,15 +1,9 @@
 """Flights side by side, each in a world of its own: the same as one environment for each."""
 
 import numpy as np
-import pytest
 
 from marl.environment import Environment, ManyWorlds, observe
-from studies.generated import generated_mission, redrawn
-
-
-@pytest.fixture(scope="module")
-def city():
-    return generated_mission(3, devices=8, side_m=(400.0, 300.0))
+from studies.generated import redrawn
 
 
 def test_many_worlds_are_as_many_environments(city):

@@ -20,11 +20,6 @@ from studies.generated import generated_mission, redrawn
 
 
 @pytest.fixture(scope="module")
-def city():
-    return generated_mission(3, devices=8, side_m=(400.0, 300.0))
-
-
-@pytest.fixture(scope="module")
 def network():
     return read_network(WEIGHTS)
 
