@@ -82,44 +82,45 @@ def test_bad_folders_get_one_message(tmp_path, name, content, words):
         read_run(tmp_path)
 
 
+@pytest.fixture(scope="module")
+def elsewhere(run_folder, tmp_path_factory):
+    """A folder of all that is read of a run, in each of the places where it is looked for."""
+    folder = shutil.copytree(run_folder, tmp_path_factory.mktemp("elsewhere") / "run")
+    for path in (folder, folder / "closeloop"):
+        path.mkdir(exist_ok=True)
+        shutil.copy(SAMPLE, path)
+        (path / "residuals.csv.gz").write_bytes(b"")
+    for path in (folder, folder / "comparison"):
+        path.mkdir(exist_ok=True)
+        (path / "compare.json").write_text('{"schema": "radiotwin.comparison/1", "scores": [], "locations": []}')
+    (folder / "config.json").write_text('{"run": {}}')
+    for file in ("flights.csv", "comparison.csv"):
+        (folder / file).write_text("flight,uav,time_s,x_m,y_m,z_m,method,trained_in,real_episodes,truth_ratio\n"
+                                   "f,u,1,2,3,4,m,t,1,0.5\n")
+    for file in ("twin/twin.json", "twin/channel.safetensors", "survey/devices.csv"):
+        shutil.copy(folder / file, folder)
+    shutil.copy(folder / "scene" / "truth.nc", folder / "map.nc")
+    pd.read_csv(folder / "survey" / "measurements.csv.gz").to_csv(folder / "measurements.csv", index=False)
+    return folder
+
+
 LINKS = ("closeloop", "comparison", "twin", "scene", "survey", "closeloop.json", "compare.json", "twin.json",
          "config.json", "flights.csv", "comparison.csv", "measurements.csv", "residuals.csv.gz", "map.nc",
          "survey/devices.csv", "scene/scene.toml")
+READ_BESIDE = {"comparison.csv": "config.json", "residuals.csv.gz": "closeloop.json"}
 
 
 @pytest.mark.parametrize("name", LINKS)
-def test_what_a_link_leads_to_is_not_read(run_folder, tmp_path, name):
+def test_what_a_link_leads_to_is_not_read(elsewhere, tmp_path, name):
     """The same content is read where it lies in the folder, and refused where a link leads out of it."""
-    elsewhere, folder = tmp_path / "elsewhere", tmp_path / "run"
-    shutil.copytree(run_folder, elsewhere)
-    report = json.loads(SAMPLE.read_text())
-    for path in (elsewhere, elsewhere / "closeloop"):
-        path.mkdir(exist_ok=True)
-        (path / "closeloop.json").write_text(json.dumps(report))
-        (path / "residuals.csv.gz").write_bytes(b"")
-    (elsewhere / "comparison").mkdir()
-    for path in (elsewhere, elsewhere / "comparison"):
-        (path / "compare.json").write_text('{"schema": "radiotwin.comparison/1", "scores": [], "locations": []}')
-    for file in ("twin.json", "channel.safetensors"):
-        shutil.copy(elsewhere / "twin" / file, elsewhere / file)
-    (elsewhere / "config.json").write_text('{"run": {}}')
-    for file in ("flights.csv", "comparison.csv"):
-        (elsewhere / file).write_text("flight,uav,time_s,x_m,y_m,z_m,method,trained_in,real_episodes,truth_ratio\n"
-                                      "f,u,1,2,3,4,m,t,1,0.5\n")
-    shutil.copy(elsewhere / "scene" / "truth.nc", elsewhere / "map.nc")
-    pd.read_csv(elsewhere / "survey" / "measurements.csv.gz").to_csv(elsewhere / "measurements.csv", index=False)
-    shutil.copy(elsewhere / "survey" / "devices.csv", elsewhere)
-    folder.mkdir()
-    if name in ("comparison.csv",):
-        shutil.copy(elsewhere / "config.json", folder)
-    if name == "residuals.csv.gz":
-        shutil.copy(elsewhere / "closeloop.json", folder)
+    if name in READ_BESIDE:
+        shutil.copy(elsewhere / READ_BESIDE[name], tmp_path)
     if "/" in name:
-        shutil.copytree(elsewhere / name.split("/")[0], folder / name.split("/")[0])
-        (folder / name).unlink()
-    (folder / name).symlink_to(elsewhere / name)
+        shutil.copytree((elsewhere / name).parent, (tmp_path / name).parent)
+        (tmp_path / name).unlink()
+    (tmp_path / name).symlink_to(elsewhere / name)
     with pytest.raises(BadInput, match="leads out of .*only files in that folder may be named"):
-        read_run(folder)
+        read_run(tmp_path)
 
 
 @pytest.mark.parametrize("name", ["closeloop.json", "twin.json", "flights.csv", "config.json", "map.nc", "measurements.csv"])
