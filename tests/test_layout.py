@@ -119,12 +119,6 @@ def test_no_modules_import_each_other_in_a_circle(folder):
         pytest.fail(" imports ".join(reversed(error.args[1])))
 
 
-def test_inference_knows_no_radio():
-    used = {name for module in in_package("radiotwin") if part_of(module) == "inference" for name in IMPORTS[module]
-            if name.startswith("radiotwin.") and part_of(name) not in ("inference", "errors")}
-    assert not used
-
-
 def test_of_radiotwin_the_command_that_plans_alone_imports_marl_and_nothing_imports_studies():
     used = {f"{module} imports {name}" for module in in_package("radiotwin") for name in IMPORTS[module]
             if name.split(".")[0] in ("marl", "studies") and (module, name.split(".")[0]) !=

@@ -73,16 +73,3 @@ def test_gains_at_points(run, folder):
     gain_db = power.loc[[0, 3], "gain_db"].astype(float).to_numpy()
     assert (gain_db > free_db - 0.1).all() and (gain_db < free_db + 6).all()  # with the ground and walls
     assert (coherent["gain_db"] != power["gain_db"])[[0, 3]].all()
-
-
-def test_a_map_in_parts(run, folder):
-    result = run("map map.nc --scene scene -o out/map.zarr", cwd=folder)
-    assert result.returncode == 0, result.stderr
-    result = run("map out/map.zarr --scene scene -o again.nc", cwd=folder)
-    assert result.returncode == 0, result.stderr
-    again, whole = (RadioMap.load(folder / name) for name in ("again.nc", "out/map.zarr"))
-    xr.testing.assert_identical(again.dataset, whole.dataset)
-    np.testing.assert_array_equal(again.gain_db, RadioMap.load(folder / "map.nc").gain_db)
-    (folder / "out" / "map.zarr" / ".zgroup").write_text("{}")
-    result = run("map out/map.zarr --scene scene -o bad.nc", cwd=folder)
-    assert result.returncode == 2 and "format 2" in result.stderr and not (folder / "bad.nc").exists()
