@@ -9,13 +9,10 @@ import shutil
 import subprocess
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from radiotwin.errors import RunFailed
 from radiotwin.maps.export import EXPORTERS
 from radiotwin.maps.survey import fly_survey
-from radiotwin.trace.link_job import BatchStore, LinkBatch
 from tests.command_line import run_planning
 from tests.worlds import placed
 
@@ -174,16 +171,6 @@ def test_a_map_in_a_process_of_its_own_ends_as_it_should(run_installed, disk, in
     result = run_installed(f"map twin --scene scene --force -o {disk}/old.nc", inputs)
     assert result.returncode == 1 and "No space left" in result.stderr, (result.returncode, result.stderr)
     assert (disk / "old.nc").read_bytes() == OLD
-
-
-def test_batches_of_a_trace(disk):
-    fill(disk, 4096)
-    store = BatchStore(disk, {"a": 1})
-    piece = LinkBatch("0", np.zeros(3), np.zeros((2000, 3)), (None, None), 100)
-    before = content(disk)
-    with pytest.raises(RunFailed, match="No space left on device"):
-        store.put(piece, np.zeros(2000), [], 0.0)
-    assert content(disk) == before and store.get(piece) is None
 
 
 def test_the_demo_stops_at_the_step_that_has_no_room(run, disk, inputs, traced):

@@ -98,7 +98,7 @@ REFUSED = [
     # Surveys, maps, exports, reports
     ("survey scene --truth traced -o new.csv", "truth.nc does not exist.*radiotwin trace"),
     ("survey scene --truth segmented --pattern spiral -o new.csv", "'spiral' is unknown; allowed are"),
-    ("survey scene --truth segmented -o new.xlsx", "unknown format"),
+    ("survey scene --truth segmented -o new.xlsx", "unknown format"), ("survey scene --truth segmented --noise-db 1e308 -o new.csv", "noise_db"),
     ("map nothing --scene scene", "not a twin's folder"), ("map twin --scene scene -o new.bmp", "unknown format '.bmp'; allowed are"),
     ("map map.nc --scene scene", "give the file to write with --out"), ("map no.nc --scene scene -o new.csv", "does not exist"),
     ("map map.nc --scene scene -o new.csv --devices d9", "device 'd9' is not in the map"),
@@ -153,6 +153,7 @@ REFUSED = [
     ("build-scene a.osm --overpass", "--overpass downloads an area; give it with --bbox"),
     ("build-scene a.osm --overpass --bbox 0,0,9,9", "are too much for a public server"),
     (f"{TOWN_IN} --altitudes 0", "altitudes of 0 m are not possible"), (f"{TOWN_IN} --altitudes 2,2", "an altitude is given twice"),
+    (f"{TOWN_IN} --uavs 1000000000", "RADIOTWIN_MAX_UAVS"),
     (f"{TOWN_IN} --step 0", "a step of 0 m is not possible"), (f"{TOWN_IN} --extent 5,5,5,9", "the minimum below the maximum"),
     (f"{TOWN_IN} --step 0.01 --extent=-900,-900,900,900", "RADIOTWIN_MAX_POSITIONS"), (f"{TOWN_IN} --extent=-1e5,0,1e5,5", "km are allowed"),
     (f"{TOWN_IN} --origin x,y", "--origin 'x,y'"), (f"{TOWN_IN} --origin 95,8", "origin.*95"),

@@ -228,11 +228,6 @@ def an_anchor_10_000_km_away(folder):
     devices.to_csv(folder / "devices.csv", index=False)
 
 
-@stranger(SURVEY + " --noise-db 1e308", "noise_db")
-def noise_of_1e308_db(folder):
-    pass
-
-
 @stranger("close-loop m.csv --devices devices.csv --base log-distance -o out", "time_s")
 def a_time_of_1e308_s(folder):
     table = pd.read_csv(folder / "m.csv")
@@ -296,13 +291,6 @@ def a_number_of_5_000_digits(folder):
     edit(folder / "scene" / "scene.toml", "frequency_hz = 2400000000.0", "frequency_hz = " + "9" * 5000)
 
 
-@stranger("build-scene city.xml --check", "city.xml")
-def defaults_that_double(folder):
-    doubling = "".join(f'<default name="a{n}" value="$a{n - 1}$a{n - 1}"/>' for n in range(1, 40))
-    (folder / "city.xml").write_text(f'<scene version="2.1.0"><default name="a0" value="xxxxxxxx"/>{doubling}<shape type="cube" '
-                                     'id="$a39"/></scene>')
-
-
 @stranger("fit wide.csv --scene scene --model log_distance -o out", "RADIOTWIN_MAX_COLUMNS")
 def names_of_100_000_columns(folder):
     columns = [*LINKS[0].strip().split(","), *(f"c{number}" for number in range(100_000))]
@@ -314,11 +302,6 @@ def devices_by_the_ten_thousand(folder):
     with (folder / "scene" / "scene.toml").open("a") as file:
         for number in range(20_000):
             file.write(f'\n[[devices]]\ndevice = "n{number}"\nx_m = {number % 300}.0\ny_m = 1.0\nz_m = 1.5\nrole = "anchor"\n')
-
-
-@stranger("build-scene town.geojson --uavs 1000000000 -o out", "RADIOTWIN_MAX_UAVS")
-def a_thousand_million_uavs(folder):
-    write_town(folder / "town.geojson")
 
 
 @pytest.mark.parametrize("prepare, command, message, status, limits", CASES)
