@@ -108,16 +108,6 @@ def test_the_answer_does_not_depend_on_the_chunk(random_links, monkeypatch):
     np.testing.assert_array_equal(city.metres_inside(a_m, b_m), whole[1])
 
 
-def test_metres_inside_count_overlapping_solids_once():
-    """From within two solids out of the one and then of the other."""
-    boxes = [trimesh.creation.box(bounds=[[0, 0, 0], [10, 10, 10]]),
-             trimesh.creation.box(bounds=[[2, 2, 0], [6, 6, 10.5]])]
-    both = trimesh.util.concatenate(boxes)
-    city = CityMap(both.vertices, both.faces)
-    np.testing.assert_allclose(city.metres_inside([[3, 3, 5.0], [-1, 3, 5]], [[13, 3, 5.0], [13, 3, 5]]), [7, 10],
-                               atol=0.1)
-
-
 def test_copies_of_a_building_change_nothing(random_links):
     """Two boxes, and each twenty times in the same place, in any order: the same sight, heights and insides."""
     boxes = [(100, 100, 200, 220, 30), (300, 400, 380, 500, 45)]

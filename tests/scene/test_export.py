@@ -17,11 +17,6 @@ from radiotwin.scene.folder import CityShape, read_city, write_city
 POINTS_M = np.array([[x, y, z] for x in (10.0, 130.0, 250.0) for y in (20.0, 170.0, 290.0) for z in (2.0, 55.0)])
 
 
-def same_meshes(shapes, others):
-    for shape, other in zip(shapes, others, strict=True):
-        assert np.array_equal(np.float32(shape.mesh.triangles), np.float32(other.triangles))
-
-
 def read_model(path):
     """Meshes and names of materials by the name of the shape, z up; glTF by trimesh, OBJ (whose objects trimesh joins
     by material) line by line."""
@@ -68,7 +63,8 @@ def test_models_hold_the_same_triangles_and_materials(small_scene, tmp_path, suf
     export_scene(small_scene, path)
     shapes = read_city(small_scene.xml_path)
     meshes, materials = read_model(path)
-    same_meshes(shapes, [meshes[shape.name] for shape in shapes])
+    for shape in shapes:
+        assert np.array_equal(np.float32(shape.mesh.triangles), np.float32(meshes[shape.name].triangles))
     assert materials == {shape.name: shape.material.name for shape in shapes}
 
 

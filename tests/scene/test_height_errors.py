@@ -19,12 +19,9 @@ def table(folder, *rows, header="building,shape,area_m2,height_sd_m"):
 
 
 def test_a_block_has_the_mean_of_its_buildings_by_area(tmp_path):
+    assert shape_height_sds_m(tmp_path) is None
     found = table(tmp_path, "way/1,block,300,1.5", "way/2,block,100,5.5", "way/3,alone,50,3")
     assert found == pytest.approx({"block": 2.5, "alone": 3.0})
-
-
-def test_scenes_without_such_a_table_say_nothing(tmp_path):
-    assert shape_height_sds_m(tmp_path) is None
     assert table(tmp_path, "way/1,block,300", header="building,shape,area_m2") is None
 
 

@@ -1,4 +1,3 @@
-import math
 
 import numpy as np
 import pytest
@@ -14,28 +13,14 @@ from radiotwin.scene.materials import (
 )
 
 
-def test_concrete_at_2_4_ghz():
-    epsilon, sigma, in_range = permittivity("concrete", 2.4e9)
-    assert epsilon == 5.24 and in_range
-    assert sigma == pytest.approx(0.0462 * math.exp(0.7822 * math.log(2.4)))
-
-
-def test_permittivity_of_ground_falls_with_frequency():
-    assert permittivity("itu_wet_ground", 5e9)[0] == pytest.approx(30 / 5**0.4)
-
-
-@pytest.mark.parametrize(
-    "frequency_ghz, end_ghz, row",
-    [
-        (0.2, 1, (3.91, 0.0238, 0.16)),
-        (60, 40, (3.91, 0.0238, 0.16)),
-        (100, 110, (4.15, 0.0006, 1.5712)),
-        (400, 330, (4.15, 0.0006, 1.5712)),
-    ],
-)
-def test_out_of_range_is_taken_at_the_nearest_end(frequency_ghz, end_ghz, row):
-    a, c, d = row
-    assert permittivity("brick", frequency_ghz * 1e9) == (a, pytest.approx(c * end_ghz**d), False)
+@pytest.mark.parametrize(("name", "frequency_ghz", "at_ghz", "row"), [
+    ("concrete", 2.4, 2.4, (5.24, 0, 0.0462, 0.7822)), ("itu_wet_ground", 5, 5, (30, -0.4, 0.15, 1.3)),
+    ("brick", 0.2, 1, (3.91, 0, 0.0238, 0.16)), ("brick", 60, 40, (3.91, 0, 0.0238, 0.16)),
+    ("brick", 100, 110, (4.15, 0, 0.0006, 1.5712)), ("brick", 400, 330, (4.15, 0, 0.0006, 1.5712))])
+def test_constants_follow_the_table_and_out_of_range_its_nearest_end(name, frequency_ghz, at_ghz, row):
+    a, b, c, d = row
+    assert permittivity(name, frequency_ghz * 1e9) == (
+        pytest.approx(a * at_ghz**b), pytest.approx(c * at_ghz**d), at_ghz == frequency_ghz)
 
 
 @pytest.mark.parametrize("text", ["mat-itu_metal", "itu_metal", "itu-metal", "metal", "mat-metal"])
@@ -43,25 +28,18 @@ def test_all_forms_of_a_name(text):
     assert itu_name(text) == "metal"
 
 
-def test_unknown_material_names_the_known_ones():
-    with pytest.raises(BadInput, match="'cheese'.*concrete.*wet_ground"):
-        itu_material("cheese")
-
-
-@pytest.mark.parametrize("frequency_hz", [0.0, -1e9, float("nan")])
-def test_impossible_frequency(frequency_hz):
-    with pytest.raises(BadInput, match="positive frequency"):
-        permittivity("concrete", frequency_hz)
-
-
-def test_traceable_keeps_what_sionna_can_load():
-    material = itu_material("concrete")
-    assert traceable(material, 2.4e9) is material
-    own = Material("own", relative_permittivity=3.0, conductivity_s_per_m=0.1)
-    assert traceable(own, 1e6) is own
+@pytest.mark.parametrize(("name", "frequency_hz", "message"), [
+    ("concrete", 0.0, "positive frequency"), ("concrete", -1e9, "positive frequency"),
+    ("concrete", float("nan"), "positive frequency"), ("cheese", 1e9, "'cheese'.*concrete.*wet_ground")])
+def test_impossible_materials_and_frequencies(name, frequency_hz, message):
+    with pytest.raises(BadInput, match=message):
+        permittivity(name, frequency_hz)
 
 
 def test_traceable_freezes_what_sionna_refuses():
+    assert traceable(itu_material("concrete"), 2.4e9) == itu_material("concrete")
+    own = Material("own", relative_permittivity=3.0, conductivity_s_per_m=0.1)
+    assert traceable(own, 1e6) is own
     fixed = traceable(itu_material("concrete", thickness_m=0.3), 868e6)
     assert fixed.itu is None and fixed.thickness_m == 0.3
     assert (fixed.relative_permittivity, fixed.conductivity_s_per_m) == (5.24, 0.0462)

@@ -11,7 +11,7 @@ import trimesh
 from radiotwin.errors import BadInput
 from radiotwin.io.budgets import SHAPES, VERTICES
 from radiotwin.scene import meshes, models
-from radiotwin.scene.build import BuildOptions, build_scene
+from radiotwin.scene.build import build_scene
 from radiotwin.scene.importer import import_city
 from radiotwin.scene.models import read_model
 
@@ -70,25 +70,24 @@ def test_objects_with_their_materials(tmp_path, city, name):
         assert mesh.is_volume and np.allclose(mesh.bounds, (low, high), atol=1e-4)
 
 
-@pytest.mark.parametrize(("name", "options"), [("a.stl", {}), ("a.ply", {}), ("ascii.stl", {})])
-def test_formats_without_objects_are_taken_apart(tmp_path, city, name, options):
+@pytest.mark.parametrize("name", ["a.stl", "a.ply", "ascii.stl"])
+def test_formats_without_objects_are_taken_apart(tmp_path, city, name):
     path = write(tmp_path, name, city)
     if name == "ascii.stl":
         path.write_text(trimesh.load(path).export(file_type="stl_ascii"))
-    report = build_scene(path, tmp_path / "out", BuildOptions(materials={"default": "brick"}))
-    assert report.shapes == 3 and [use.name for use in report.materials] == ["brick"] and not report.problems
-    assert report.tallest_m == pytest.approx(40)
+    found = import_city(path, {"default": "brick"})
+    assert [material.name for material in found.materials] == ["brick"] * 3 and not found.problems
+    assert found.surfaces.vertices[:, 2].max() == pytest.approx(40)
 
 
-def test_a_material_of_unknown_name_is_told(tmp_path, city):
+def test_materials_of_other_names(tmp_path, city):
     path = write(tmp_path, "a.stl", city)
-    (problem,) = build_scene(path, tmp_path / "out").problems
+    (problem,) = import_city(path, {}).problems
     assert "1 material(s) have no name of an ITU material ('(no material)'): concrete was taken" in problem.message
     with pytest.raises(BadInput, match="material 'roof' is to be replaced, but the city does not use it"):
-        build_scene(path, tmp_path / "out", BuildOptions(materials={"roof": "metal"}))
-    path = write(tmp_path, "a.obj", city)
-    report = build_scene(path, tmp_path / "out", BuildOptions(materials={"Wood.001": "glass"}))
-    assert {use.name for use in report.materials} == {"wet_ground", "metal", "glass"}
+        import_city(path, {"roof": "metal"})
+    found = import_city(write(tmp_path, "a.obj", city), {"Wood.001": "glass"})
+    assert {material.name for material in found.materials} == {"wet_ground", "metal", "glass"}
 
 
 def test_the_axis_of_a_model_can_be_declared(tmp_path, city):

@@ -6,7 +6,6 @@ import trimesh
 
 from radiotwin.scene.citymap import CityMap, building_of_vertex, perturbed_map
 from radiotwin.scene.materials import Material
-from radiotwin.scene.vegetation import Vegetation, VegetationConfig
 
 SIDE = 12  # houses along each side of the town
 
@@ -64,9 +63,3 @@ def test_a_seed_moves_walls_the_same_way_whatever_the_size(town):
     np.testing.assert_allclose(large, 4 * small, atol=1e-9)
     other = perturbed_map(town, 1.0, 0.0, 8).vertices - town.vertices
     assert not np.allclose(other, small)
-
-
-def test_woods_stay_where_they_are(town):
-    wood = VegetationConfig(name="w", kind="wood", height_m=15.0, rings_m=[[(0.0, 0.0), (90.0, 0.0), (90.0, 90.0)]])
-    wooded = CityMap(town.vertices, town.faces, town.materials, town.material, Vegetation.of([wood]))
-    assert perturbed_map(wooded, 1.0, 2.0, 0).vegetation is wooded.vegetation

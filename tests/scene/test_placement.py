@@ -34,10 +34,32 @@ def gap(device, house):
     return np.hypot(max(x0 - device.x_m, 0, device.x_m - x1), max(y0 - device.y_m, 0, device.y_m - y1))
 
 
-def test_built_fraction(buildings):
-    assert BuiltGrid.over(EXTENT, buildings).fraction == pytest.approx(
-        (40 * 80 + 60 * 40 + 40 * 40) / 60_000, abs=0.002
-    )
+@pytest.mark.parametrize("tops, lowest", [([], 30), ([12.0] * 10, 30), ([20.1] * 10, 35), ([10.0] * 99 + [300], 30)])
+def test_altitudes(tops, lowest):
+    assert choose_altitudes(np.array(tops)) == [lowest, lowest + 5, lowest + 10]
+
+
+@pytest.mark.parametrize("side_m, step_m", [(1000, 20), (100, 20), (99, 10), (12, 2), (0.8, 0.1)])
+def test_step(side_m, step_m):
+    assert choose_step((0, 5 * side_m, 0, side_m)) == step_m
+    assert choose_extent((-755.2, 655.1, -648, 480)).bounds == (-760, 660, -660, 480)
+
+
+def placed(buildings, count, bounds, at):
+    """Place devices, or UAVs at altitudes, on a part (x_min, x_max, y_min, y_max)."""
+    extent = Extent(**dict(zip(("x_min_m", "x_max_m", "y_min_m", "y_max_m"), bounds)))
+    if at:
+        return place_uavs(count, extent, LatticeConfig(step_m=10, altitudes_m=at), buildings)
+    return place_devices(count, BuiltGrid.over(extent, buildings), None, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize(("count", "bounds", "at", "message"), [
+    (4, (-80, -40, 40, 120), [], "4 devices.*not enough ground"),
+    (1, (-75, -45, 45, 115), [20], "20 m every lattice position"),
+    (1, (0, 1e5, 0, 1e-3), [], "an extent of 100000 x 0.001 m is but a line")])
+def test_no_room(buildings, count, bounds, at, message):
+    with pytest.raises(BadInput, match=message):
+        placed(buildings, count, bounds, at)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -45,6 +67,8 @@ def test_devices_are_clear_of_buildings_and_apart(buildings, seed):
     grid = BuiltGrid.over(EXTENT, buildings)
     devices = place_devices(10, grid, None, np.random.default_rng(seed))
     assert len(devices) == 10 and {device.z_m for device in devices} == {1.5}
+    assert grid.fraction == pytest.approx((40 * 80 + 60 * 40 + 40 * 40) / 60_000, abs=0.002)
+    assert {device.role for device in place_devices(2, grid, None, np.random.default_rng(seed))} == {"anchor"}
     assert sum(device.role == "anchor" for device in devices) == 3
     for device in devices:
         assert min(gap(device, house) for house in HOUSES) >= 9.0
@@ -57,22 +81,9 @@ def test_devices_are_clear_of_buildings_and_apart(buildings, seed):
 
 
 def test_devices_stand_on_the_ground_that_there_is(buildings):
-    slope = CityMap(
-        np.array([[-100, 0, 10], [100, 0, 10], [100, 300, 40], [-100, 300, 40.0]]), np.array([[0, 1, 2], [0, 2, 3]])
-    )
+    slope = CityMap([[-100, 0, 10], [100, 0, 10], [100, 300, 40], [-100, 300, 40.0]], [[0, 1, 2], [0, 2, 3]])
     for device in place_devices(5, BuiltGrid.over(EXTENT, buildings), slope, np.random.default_rng(0)):
         assert device.z_m == pytest.approx(10 + device.y_m / 10 + 1.5, abs=0.02)
-
-
-def test_few_devices_are_all_anchors(buildings):
-    devices = place_devices(2, BuiltGrid.over(EXTENT, buildings), None, np.random.default_rng(0))
-    assert [device.role for device in devices] == ["anchor", "anchor"]
-
-
-def test_no_room_for_devices(buildings):
-    grid = BuiltGrid.over(Extent(x_min_m=-80, x_max_m=-40, y_min_m=40, y_max_m=120), buildings)
-    with pytest.raises(BadInput, match="4 devices.*not enough ground"):
-        place_devices(4, grid, None, np.random.default_rng(0))
 
 
 def test_uavs_start_beside_the_tower(buildings):
@@ -84,26 +95,6 @@ def test_uavs_start_beside_the_tower(buildings):
     assert (low.start_x_m, low.start_y_m) == (low.terminal_x_m, low.terminal_y_m)
 
 
-def test_no_free_lattice_position(buildings):
-    extent = Extent(x_min_m=-75, x_max_m=-45, y_min_m=45, y_max_m=115)
-    with pytest.raises(BadInput, match="20 m every lattice position"):
-        place_uavs(1, extent, LatticeConfig(step_m=10, altitudes_m=[20]), buildings)
-
-
-@pytest.mark.parametrize("tops, lowest", [([], 30), ([12.0] * 10, 30), ([20.1] * 10, 35), ([10.0] * 99 + [300], 30)])
-def test_altitudes(tops, lowest):
-    assert choose_altitudes(np.array(tops)) == [lowest, lowest + 5, lowest + 10]
-
-
-@pytest.mark.parametrize("side_m, step_m", [(1000, 20), (100, 20), (99, 10), (12, 2), (0.8, 0.1)])
-def test_step(side_m, step_m):
-    assert choose_step((0, 5 * side_m, 0, side_m)) == step_m
-
-
-def test_extent_lies_on_the_lattice():
-    assert choose_extent((-755.2, 655.1, -648, 480)).bounds == (-760, 660, -660, 480)
-
-
 def test_thousands_of_devices_and_uavs_are_placed():
     extent = Extent(x_min_m=0, x_max_m=3000, y_min_m=0, y_max_m=3000)
     grid = BuiltGrid.over(extent, None)
@@ -113,8 +104,3 @@ def test_thousands_of_devices_and_uavs_are_placed():
     for options in (BuildOptions(devices=10**9), BuildOptions(uavs=10**9)):
         with pytest.raises(BadInput, match="1,000,000,000 .* at most"):
             options.check()
-
-
-def test_an_extent_like_a_line_is_refused():
-    with pytest.raises(BadInput, match="an extent of 100000 x 0.001 m is but a line"):
-        BuiltGrid.over(Extent(x_min_m=0, x_max_m=1e5, y_min_m=0, y_max_m=1e-3), None)

@@ -16,10 +16,7 @@ def scene(town, tmp_path):
 def test_height_grid_lies_where_the_houses_are(scene):
     height_m, (x_min, _, y_min, _) = height_grid(scene, cells=200)
     cell_m = (scene.config.extent.x_max_m - x_min) / 200
-    row, column = (
-        int((60 - y_min) / cell_m),
-        int((-60 - x_min) / cell_m),
-    )  # within house6: x -70..-50, y 50..70
+    row, column = int((60 - y_min) / cell_m), int((-60 - x_min) / cell_m)  # within house6: x -70..-50, y 50..70
     assert height_m[row, column] == pytest.approx(20.0, abs=1e-3)
     assert (height_m > 1).mean() == pytest.approx(9 * 400 / 160**2, abs=0.01)
 

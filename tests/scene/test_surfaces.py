@@ -3,14 +3,8 @@ import pytest
 
 from radiotwin.scene.surfaces import Surfaces
 
-QUADS = {
-    "bottom": [0, 3, 2, 1],
-    "top": [4, 5, 6, 7],
-    "south": [0, 1, 5, 4],
-    "east": [1, 2, 6, 5],
-    "north": [2, 3, 7, 6],
-    "west": [3, 0, 4, 7],
-}
+QUADS = {"bottom": [0, 3, 2, 1], "top": [4, 5, 6, 7], "south": [0, 1, 5, 4], "east": [1, 2, 6, 5], "north": [2, 3, 7, 6],
+         "west": [3, 0, 4, 7]}
 
 
 def box(x=(0, 10), y=(0, 10), z=(0, 10), sides=tuple(QUADS), inside_out=False):
@@ -66,6 +60,7 @@ def test_streets_on_flat_ground_are_ground():
     street = PLANE[0] * [0.05, 1, 1] + [0, 0, 0.1], PLANE[1]
     surfaces = Surfaces([PLANE, street, box(z=(0, 15))])
     np.testing.assert_array_equal(surfaces.ground_faces(), surfaces.shape < 2)
+    assert not Surfaces([box(), box(x=(12, 22)), box(y=(12, 22))]).ground_faces().any()
 
 
 def test_terrain_is_ground():
@@ -86,16 +81,6 @@ def test_ground_within_one_mesh_with_the_buildings():
     ring = np.array([part for a, b in ((0, 1), (1, 2), (2, 3), (3, 0)) for part in ((8 + a, 8 + b, b), (8 + a, b, a))])
     surfaces = Surfaces([(np.concatenate([corners, rim]), np.concatenate([faces, ring]))])
     np.testing.assert_array_equal(surfaces.ground_faces(), np.arange(len(surfaces.faces)) >= len(faces))
-
-
-def test_boxes_alone_have_no_ground():
-    assert not Surfaces([box(), box(x=(12, 22)), box(y=(12, 22))]).ground_faces().any()
-
-
-def test_kept_faces_keep_their_places():
-    surfaces = Surfaces([box(), box(x=(20, 30))])
-    ((vertices, faces),) = surfaces.meshes(surfaces.shape == 1)
-    np.testing.assert_array_equal(np.sort(vertices[faces].reshape(-1, 3), axis=0)[[0, -1]], [[20, 0, 0], [30, 10, 10]])
 
 
 def test_level_is_the_height_of_most_of_the_area():

@@ -10,7 +10,6 @@ from scipy.ndimage import gaussian_filter
 
 from radiotwin.errors import BadInput
 from radiotwin.scene.citymap import CityMap, perturbed_map
-from radiotwin.scene.config import parse_config
 from radiotwin.scene.lattice import Lattice
 from radiotwin.scene.readers.terrain import HeightGrid, approximate
 from radiotwin.scene.vegetation import Vegetation, VegetationConfig
@@ -123,18 +122,6 @@ def test_vegetation_stands_on_the_slope():
     assert found_m == pytest.approx([40 * np.hypot(1, 0.5), 0, 0], abs=2.5)
     level = np.array([[-100.0, 0, 108.0]]), np.array([[100.0, 0, 108.0]])  # through x = -16 … 16 m of it
     assert wood.metres_through(*level, city.ground_height_m) == pytest.approx([32], abs=2.5)
-
-
-DECLARED = {"schema": "radiotwin.scene/1", "name": "a", "extent": {"x_min_m": 0, "x_max_m": 9, "y_min_m": 0, "y_max_m": 9},
-            "lattice": {"step_m": 3, "altitudes_m": [30]}}
-
-
-def test_a_height_is_above_the_datum_or_above_the_ground_not_both():
-    device = {"device": "d", "x_m": 1, "y_m": 1}
-    with pytest.raises(BadInput, match=r"devices.0: z_m \(above the datum\) and above_ground_m are both given"):
-        parse_config(DECLARED | {"devices": [device | {"z_m": 2, "above_ground_m": 2}]}, "scene.toml")
-    with pytest.raises(BadInput, match="lattice.above = 'sea': Input should be 'datum' or 'ground'"):
-        parse_config(DECLARED | {"lattice": {"altitudes_m": [3], "above": "sea"}}, "scene.toml")
 
 
 def test_a_map_that_goes_to_another_process_keeps_its_terrain():

@@ -30,9 +30,14 @@ def test_ways_through_a_square_wood_by_hand():
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
-def test_a_clearing_is_no_wood():
-    hole = [(40.0, 40.0), (60.0, 40.0), (60.0, 60.0), (40.0, 60.0)]
-    np.testing.assert_allclose(through([wood(holes=[hole])], [(-50, 50, 10), (150, 50, 10)]), 80)
+HOLE = [(40.0, 40.0), (60.0, 40.0), (60.0, 60.0), (40.0, 60.0)]
+BOW = [(0.0, 0.0), (100.0, 100.0), (100.0, 0.0), (0.0, 100.0)]
+
+
+@pytest.mark.parametrize(("declared", "way", "metres"), [
+    (wood(holes=[HOLE]), [(-50, 50, 10), (150, 50, 10)], 80), (wood(BOW), [(25, -50, 5), (25, 150, 5)], 50)])
+def test_clearings_and_outlines_that_cross_themselves(declared, way, metres):
+    np.testing.assert_allclose(through([declared], way), metres)
 
 
 def test_of_two_that_overlap_the_higher_one_counts_and_none_twice():
@@ -61,11 +66,6 @@ def test_many_ways_agree_with_points_along_them():
 def test_what_no_vegetation_has_is_refused(wrong):
     with pytest.raises(ValidationError):
         wood(**wrong)
-
-
-def test_an_outline_that_crosses_itself_is_repaired():
-    bow = [(0.0, 0.0), (100.0, 100.0), (100.0, 0.0), (0.0, 100.0)]
-    np.testing.assert_allclose(through([wood(bow)], [(25, -50, 5), (25, 150, 5)]), 50)
 
 
 def comb(teeth, upright):

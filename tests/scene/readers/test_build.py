@@ -1,6 +1,5 @@
 """A map becomes a scene that the rest of the package works with."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,6 @@ from radiotwin.geo import local_crs, to_local
 from radiotwin.scene import Scene
 from radiotwin.scene.build import BuildOptions
 from radiotwin.scene.readers import build_scene_from_map
-from radiotwin.scene.readers.build import map_name, map_suffix
 from tests.scene.readers.conftest import write_geojson
 
 TOWN = Path(__file__).with_name("town.osm")
@@ -27,11 +25,6 @@ def report(tmp_path_factory):
 @pytest.fixture(scope="module")
 def table(report):
     return pd.read_csv(report.folder / "buildings.csv", keep_default_na=False).set_index("building")
-
-
-def test_names():
-    assert map_suffix("a.b.OSM.pbf") == ".osm.pbf" and map_suffix("a.osm") == ".osm" and map_suffix("a.xml") is None
-    assert map_name("data/old town.osm.pbf") == "old_town" and map_name("area.v2.geojson") == "area.v2"
 
 
 def test_every_height_has_its_source(table, report):
@@ -94,16 +87,6 @@ def test_meshes_are_watertight_and_face_outwards(report, table):
     assert set(table["shape"]) == {path.stem for path in (report.folder / "meshes").glob("*.ply")} - {"ground"}
 
 
-def test_a_box_within_a_part_that_lies_in_another_part(tmp_path):
-    """The parts of an outline are united: there is a building, and no courtyard."""
-    rings = [[[[x, 47.5 + y] for x, y in ((-a, -a), (a, -a), (a, a), (-a, a), (-a, -a))]] for a in (3e-4, 1.5e-4)]
-    (tmp_path / "a.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": [
-        {"type": "Feature", "properties": {"height": 9}, "geometry": {"type": "MultiPolygon", "coordinates": rings}}]}))
-    report = build_scene_from_map(tmp_path / "a.geojson", tmp_path / "out",
-                                  BuildOptions(bbox=(47.49995, -5e-5, 47.50005, 5e-5)))
-    assert pd.read_csv(report.folder / "buildings.csv")["area_m2"].tolist() == [pytest.approx(3010, rel=0.01)]
-
-
 def test_a_box_of_degrees(tmp_path):
     box = 47.4998, 8.699, 47.5002, 8.7001
     report = build_scene_from_map(TOWN, tmp_path / "part", BuildOptions(bbox=box, default_height_m=4.5))
@@ -147,10 +130,14 @@ def test_impossible_options(tmp_path, options, message):
     assert not (tmp_path / "out").exists()
 
 
-def test_too_far_apart(tmp_path, empty_map):
-    path = empty_map.box(0, 0, 20, 20).box(90_000, 0, 90_020, 20).write(tmp_path / "a.osm")
-    with pytest.raises(BadInput, match="the area is 90 km wide, 50 km are allowed; choose a part with --bbox"):
-        build_scene_from_map(path, tmp_path / "out")
+@pytest.mark.parametrize(("boxes", "message"), [
+    ([(0, 0, 20, 20), (90_000, 0, 90_020, 20)], "the area is 90 km wide, 50 km are allowed; choose a part with --bbox"),
+    ([(0, 0, 0, 20)], "none of its 1 buildings can be used; correct what is wrong with them:\n.*have no area")])
+def test_maps_that_cannot_be_used(tmp_path, empty_map, boxes, message):
+    for box in boxes:
+        empty_map.box(*box)
+    with pytest.raises(BadInput, match=message):
+        build_scene_from_map(empty_map.write(tmp_path / "a.osm"), tmp_path / "out")
 
 
 def test_a_ring_of_three_points_is_no_building(tmp_path):
@@ -159,9 +146,3 @@ def test_a_ring_of_three_points_is_no_building(tmp_path):
     report = build_scene_from_map(write_geojson(tmp_path / "a.geojson", [(ring, {}) for ring in rings]), tmp_path / "out")
     assert dict(report.facts)["buildings"] == "1 in 1 blocks"
     assert "2 building(s) have no area" in report.problems[0].message
-
-
-def test_nothing_usable_gives_the_reasons(tmp_path, empty_map):
-    path = empty_map.box(0, 0, 0, 20).write(tmp_path / "a.osm")
-    with pytest.raises(BadInput, match="none of its 1 buildings can be used; correct what is wrong with them:\n.*have no area"):
-        build_scene_from_map(path, tmp_path / "out")

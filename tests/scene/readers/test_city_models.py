@@ -155,6 +155,24 @@ def test_what_is_inside_of_a_building_and_placed_copies_are_left_out(tmp_path):
     assert len(one.shell.polygons) == len(made.FACES)
 
 
+TEMPLATE = {"type": "GeometryInstance", "template": 0, "boundaries": [0], "transformationMatrix": [1] * 16}
+
+
+@pytest.mark.parametrize("geometry", [[], [TEMPLATE]])
+def test_what_is_no_building_is_told(tmp_path, geometry):
+    model = made.cityjson(HOUSES)
+    del model["CityObjects"]["B0-0"]
+    model["CityObjects"]["B0"] = {"type": "Building", "geometry": geometry}
+    for name, kind in (("T", "TINRelief"), ("X", "+Fence")):
+        model["CityObjects"][name] = {"type": kind, "geometry": [
+            {"type": "CompositeSurface", "lod": "1", "boundaries": [[[0, 1, 2]]]}]}
+    report = build_scene_from_map(write(tmp_path, model), tmp_path / "scene")
+    said = "\n".join(one.message for one in report.problems)
+    assert len(pd.read_csv(report.folder / "buildings.csv")) == 2
+    assert "1 object(s) have no surfaces" in said and "'B0'" in said
+    assert "2 objects are neither buildings nor bridges" in said and "'TINRelief: 1'" in said
+
+
 def test_each_building_of_a_group_stands_on_its_own_ground(tmp_path):
     model = made.cityjson([(0, 0, 1.0), (40, 0, 31.0)])
     for name in ("B0", "B1"):
@@ -164,26 +182,6 @@ def test_each_building_of_a_group_stands_on_its_own_ground(tmp_path):
     rows = pd.read_csv(report.folder / "buildings.csv")
     assert rows["building"].tolist() == ["B0", "B1"]
     assert (rows["bottom_m"] == 0).all() and rows["top_m"].tolist() == pytest.approx([9, 9], abs=0.01)
-
-
-@pytest.mark.parametrize("geometry", [[], [{"type": "GeometryInstance", "template": 0, "boundaries": [0],
-                                            "transformationMatrix": [1] * 16}]])
-def test_a_building_without_surfaces_is_told(tmp_path, geometry):
-    model = made.cityjson(HOUSES)
-    del model["CityObjects"]["B0-0"]
-    model["CityObjects"]["B0"] = {"type": "Building", "geometry": geometry}
-    report = build_scene_from_map(write(tmp_path, model), tmp_path / "scene")
-    assert len(pd.read_csv(report.folder / "buildings.csv")) == 2
-    assert any("1 object(s) have no surfaces" in one.message and "'B0'" in one.message for one in report.problems)
-
-
-def test_other_objects_are_counted(tmp_path):
-    model = made.cityjson(HOUSES)
-    model["CityObjects"]["T"] = {"type": "TINRelief", "geometry": [
-        {"type": "CompositeSurface", "lod": "1", "boundaries": [[[0, 1, 2]]]}]}
-    model["CityObjects"]["X"] = {"type": "+Fence", "geometry": model["CityObjects"]["T"]["geometry"]}
-    (problem,) = read_json_map(write(tmp_path, model)).problems
-    assert "2 objects are neither buildings nor bridges" in problem.message and "'TINRelief: 1'" in problem.message
 
 
 @pytest.mark.parametrize("lost", [0, 5])
@@ -197,15 +195,6 @@ def test_an_open_shell_is_kept_and_told(tmp_path, lost):
     assert not mesh.is_watertight and mesh.bounds[1, 2] == pytest.approx(9, abs=1e-3)
     up = mesh.face_normals[:, 2] > 0.5  # roofs face outwards
     assert up.sum() == 4 if lost == 0 else up.any()
-
-
-def test_surfaces_that_face_either_way_become_a_solid(tmp_path):
-    model = made.cityjson([(0, 0, 0)])
-    for surface in model["CityObjects"]["B0-0"]["geometry"][0]["boundaries"][0][::2]:
-        surface[0].reverse()
-    report = build_scene_from_map(write(tmp_path, model), tmp_path / "out")
-    (mesh,) = solids(report).values()
-    assert mesh.is_volume and mesh.volume == pytest.approx(made.VOLUME_M3, rel=2e-3) and not report.problems
 
 
 def test_a_wall_with_a_hole(tmp_path):
@@ -224,6 +213,29 @@ def test_a_wall_with_a_hole(tmp_path):
     assert mesh.is_volume and mesh.volume == pytest.approx(made.VOLUME_M3 - 120, rel=2e-3)
 
 
+def turn_surfaces(model):
+    for surface in model["CityObjects"]["B0-0"]["geometry"][0]["boundaries"][0][::2]:
+        surface[0].reverse()
+
+
+def own_part(model):
+    model["CityObjects"]["B0"]["parents"] = ["B0-0"]
+
+
+def in_feet(model):  # New York's model is in feet, its elevations, too
+    model["metadata"]["referenceSystem"] = "https://www.opengis.net/def/crs/EPSG/0/2263"
+    model["transform"]["translate"] = [987_000, 195_000, 0]
+
+
+@pytest.mark.parametrize(("change", "unit_m"), [(turn_surfaces, 1.0), (own_part, 1.0), (in_feet, 0.3048003)])
+def test_models_that_differ_make_the_same_solid(tmp_path, change, unit_m):
+    model = made.cityjson([(0, 0, 0)])
+    change(model)
+    report = build_scene_from_map(write(tmp_path, model), tmp_path / "out")
+    (mesh,) = solids(report).values()
+    assert mesh.is_volume and mesh.volume == pytest.approx(made.VOLUME_M3 * unit_m**3, rel=2e-3)
+
+
 def test_neighbours_of_other_materials_are_apart(tmp_path):
     model = made.cityjson(HOUSES[:2])
     model["CityObjects"]["B1"]["attributes"] = {"building_material": "brick"}
@@ -234,21 +246,6 @@ def test_neighbours_of_other_materials_are_apart(tmp_path):
     assert sum(mesh.volume for mesh in found.values()) == pytest.approx(2 * made.VOLUME_M3, rel=4e-3)
     first, second = found.values()
     assert trimesh.boolean.intersection([first, second], engine="manifold").is_empty  # between them is a slot
-
-
-def test_feet(tmp_path):
-    """New York's model is in feet, its elevations, too."""
-    model = made.cityjson([(0, 0, 0)], system="https://www.opengis.net/def/crs/EPSG/0/2263", at=(987_000, 195_000))
-    report = build_scene_from_map(write(tmp_path, model), tmp_path / "out")
-    (mesh,) = solids(report).values()
-    assert mesh.volume == pytest.approx(made.VOLUME_M3 * 0.3048006**3, rel=2e-3)
-
-
-def test_a_box_keeps_what_lies_in_it(tmp_path):
-    path = write(tmp_path, made.cityjson(HOUSES))
-    west, south = Transformer.from_crs("EPSG:28992", "EPSG:4326", always_xy=True).transform(85_030, 445_990)
-    report = build_scene_from_map(path, tmp_path / "out", BuildOptions(bbox=(south, west, south + 0.001, west + 0.001)))
-    assert dict(report.facts)["buildings"] == "1 in 1 blocks"
 
 
 def test_a_box_keeps_all_parts_of_a_building(tmp_path):
@@ -298,13 +295,6 @@ BAD_JSON = {
 }
 
 
-@pytest.mark.parametrize("text", BAD_JSON)
-def test_broken_cityjson(tmp_path, text):
-    with pytest.raises(BadInput, match=BAD_JSON[text]):
-        build_scene_from_map(write(tmp_path, text), tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-
-
 GOOD_GML = made.citygml(gml_houses([(0, 0, 0)]))
 BAD_GML = {
     "": "malformed XML", GOOD_GML[:3000]: "malformed XML", "<gpx/>": "begins with <gpx>, not <CityModel>",
@@ -320,10 +310,11 @@ BAD_GML = {
 }
 
 
-@pytest.mark.parametrize("text", BAD_GML)
-def test_broken_citygml(tmp_path, text):
-    with pytest.raises(BadInput, match=BAD_GML[text]):
-        build_scene_from_map(write(tmp_path, text, "a.gml"), tmp_path / "out")
+@pytest.mark.parametrize(("name", "text", "message"), [
+    *(("a.city.json", *row) for row in BAD_JSON.items()), *(("a.gml", *row) for row in BAD_GML.items())])
+def test_broken_models(tmp_path, name, text, message):
+    with pytest.raises(BadInput, match=message):
+        build_scene_from_map(write(tmp_path, text, name), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -356,13 +347,6 @@ def test_a_body_stands_where_its_prism_does(tmp_path):
     (block,) = make_blocks([raised], find_contacts([raised]))
     assert block.mesh.is_volume and block.mesh.bounds[:, 2] == pytest.approx([4, 14], abs=1e-3)
     assert block.mesh.volume == pytest.approx(made.VOLUME_M3 + 120, rel=2e-3)
-
-
-def test_an_object_that_is_a_part_of_itself(tmp_path):
-    model = made.cityjson([(0, 0, 0)])
-    model["CityObjects"]["B0"]["parents"] = ["B0-0"]
-    report = build_scene_from_map(write(tmp_path, model), tmp_path / "out", check_only=True)
-    assert report.shapes == 2 and report.tallest_m == pytest.approx(9, abs=1e-3)
 
 
 def test_a_text_without_an_end(tmp_path, monkeypatch):

@@ -43,6 +43,19 @@ def test_any_system(tmp_path, crs):
     assert one.area.bounds[:2] == pytest.approx((8.7, 47.5), abs=0.02)
 
 
+@pytest.mark.parametrize(("how", "message"), [
+    ({"geo": False}, "is Parquet without geometries"), ({"encoding": "polygon"}, "are encoded as 'polygon'; only WKB"),
+    ({"crs": {"type": "GeographicCRS"}}, "its coordinate reference system is unknown"),
+    ({"crs": [1]}, "is not as GeoParquet has it"), ({"wkb": [b"\1\3\0"]}, "a geometry is damaged"),
+    ({"cut": 200}, "cannot be read as Parquet"), ({"most": "1"}, "2 buildings; at most 1 are read")])
+def test_files_that_are_refused(tmp_path, monkeypatch, how, message):
+    path = write(tmp_path / "a.parquet", DEGREES, DEGREES, **{key: how[key] for key in how if key not in ("cut", "most")})
+    path.write_bytes(path.read_bytes()[:how.get("cut")])
+    monkeypatch.setenv("RADIOTWIN_MAX_FEATURES", how.get("most", "9"))
+    with pytest.raises(BadInput, match=message):
+        read_geoparquet(path)
+
+
 def test_a_file_without_a_system_needs_one(tmp_path):
     path = write(tmp_path / "a.parquet", UTM, crs=None)
     with pytest.raises(BadInput, match="a.parquet has no coordinate reference system; declare it with --crs"):
@@ -53,23 +66,3 @@ def test_a_file_without_a_system_needs_one(tmp_path):
     assert read_geoparquet(named, "EPSG:32632").features
     with pytest.raises(BadInput, match="is in 'WGS 84 / UTM zone 32N', and --crs says 'WGS 84 / UTM zone 33N'"):
         read_geoparquet(named, "EPSG:32633")
-
-
-@pytest.mark.parametrize(("how", "message"), [
-    ({"geo": False}, "is Parquet without geometries"), ({"encoding": "polygon"}, "are encoded as 'polygon'; only WKB"),
-    ({"crs": {"type": "GeographicCRS"}}, "its coordinate reference system is unknown"), ({"crs": [1]}, "is not as GeoParquet has it")])
-def test_files_that_are_refused(tmp_path, how, message):
-    with pytest.raises(BadInput, match=message):
-        read_geoparquet(write(tmp_path / "a.parquet", DEGREES, **how))
-
-
-def test_damaged_files(tmp_path, monkeypatch):
-    path = write(tmp_path / "a.parquet", DEGREES, DEGREES)
-    (tmp_path / "b.parquet").write_bytes(path.read_bytes()[:200])
-    with pytest.raises(BadInput, match="cannot be read as Parquet"):
-        read_geoparquet(tmp_path / "b.parquet")
-    with pytest.raises(BadInput, match="a geometry is damaged"):
-        read_geoparquet(write(tmp_path / "c.parquet", wkb=[b"\1\3\0"]))
-    monkeypatch.setenv("RADIOTWIN_MAX_FEATURES", "1")
-    with pytest.raises(BadInput, match="2 buildings; at most 1 are read"):
-        read_geoparquet(path)

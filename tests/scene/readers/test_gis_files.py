@@ -31,26 +31,25 @@ def test_columns_are_tags(tmp_path):
     assert one.area.bounds == pytest.approx((8.7, 47.5, 8.7002, 47.5001))
 
 
+HOLE = [[8.7001, 47.50002], [8.7001, 47.50008], [8.70015, 47.50008], [8.7001, 47.50002]]
+WINGS = feature([[SQUARE, HOLE], [[[lon + 0.01, lat] for lon, lat in SQUARE]]], "MultiPolygon")
+COLLECTION = {"type": "Feature", "properties": {}, "geometry": {"type": "GeometryCollection", "geometries": [
+    {"type": "Point", "coordinates": SQUARE[0]}, {"type": "Polygon", "coordinates": [SQUARE]}]}}
+
+
+@pytest.mark.parametrize(("row", "holes"), [(WINGS, [1, 0]), (COLLECTION, [0])])
+def test_courtyards_wings_and_collections_of_geometries(tmp_path, row, holes):
+    (one,) = read(tmp_path, collection(row)).features
+    assert [len(part.interiors) for part in one.area.geoms] == holes
+    assert one.area.geoms[0].bounds == pytest.approx((8.7, 47.5, 8.7002, 47.5001))
+
+
 def test_where_buildings_are_marked_other_rows_are_ignored(tmp_path):
     found = read(tmp_path, collection(feature(building="yes"), feature(leisure="park"), feature(building="no"),
                                       {**feature(building="yes"), "geometry": None}))
     assert [one.name for one in found.features] == ["feature 1"]
     (said,) = left_out_problems(found.left_out, None)
     assert "no geometry" in said.message and "feature 4" in said.message
-
-
-def test_courtyards_and_wings(tmp_path):
-    hole = [[8.7001, 47.50002], [8.7001, 47.50008], [8.70015, 47.50008], [8.7001, 47.50002]]
-    far = [[lon + 0.01, lat] for lon, lat in SQUARE]
-    (one,) = read(tmp_path, collection(feature([[SQUARE, hole], [far]], "MultiPolygon"))).features
-    assert [len(part.interiors) for part in one.area.geoms] == [1, 0]
-
-
-def test_polygons_of_a_collection_of_geometries(tmp_path):
-    parts = [{"type": "Point", "coordinates": SQUARE[0]}, {"type": "Polygon", "coordinates": [SQUARE]}]
-    (one,) = read(tmp_path, collection({"type": "Feature", "properties": {}, "geometry": {
-        "type": "GeometryCollection", "geometries": parts}})).features
-    assert one.area.bounds == pytest.approx((8.7, 47.5, 8.7002, 47.5001))
 
 
 @pytest.mark.parametrize(("text", "message"), [
@@ -89,7 +88,10 @@ def test_a_geopackage_in_another_system(package):
     assert abs(area_m2) == pytest.approx(400, rel=2e-3)  # UTM's scale is 0.9996
 
 
-@pytest.mark.parametrize("data", [b"", b"SQLite format 3\x00", b"not a package"])
+VRT = b"<OGRVRTDataSource><OGRVRTLayer name='x'><SrcDataSource>a.gpkg</SrcDataSource></OGRVRTLayer></OGRVRTDataSource>"
+
+
+@pytest.mark.parametrize("data", [b"", b"SQLite format 3\x00", b"not a package", VRT])
 def test_broken_geopackage(tmp_path, data):
     (tmp_path / "a.gpkg").write_bytes(data)
     with pytest.raises(BadInput, match="not a readable GeoPackage"):

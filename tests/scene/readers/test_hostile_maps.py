@@ -27,23 +27,15 @@ def circle(corners, step=1):
                   100 * math.sin(2 * math.pi * i * step / corners)) for i in range(corners)])
 
 
-def test_an_outline_that_crosses_itself_everywhere(tmp_path, monkeypatch):
-    monkeypatch.setenv(CROSSINGS.variable, "1000")
-    with pytest.raises(BadInput, match="feature 1: .* crossings .*RADIOTWIN_MAX_CROSSINGS"):
-        check(tmp_path, circle(101, 50))
+@pytest.mark.parametrize(("budget", "limit", "rings", "message"), [
+    (CROSSINGS, "1000", [circle(101, 50)], "feature 1: .* crossings .*RADIOTWIN_MAX_CROSSINGS"),
+    (OUTLINE_CORNERS, "100", [box(300, 0), circle(101)], "feature 2: 102 corners; at most 100"),
+    (OVERLAPS, "100", [box(0, 0)] * 20, "pairs of buildings that overlap; at most 100")])
+def test_budgets(tmp_path, monkeypatch, budget, limit, rings, message):
+    monkeypatch.setenv(budget.variable, limit)
+    with pytest.raises(BadInput, match=message):
+        check(tmp_path, *rings)
     assert check(tmp_path, circle(11, 5)).problems[0].severity in ("fixed", "warning")
-
-
-def test_an_outline_of_too_many_corners(tmp_path, monkeypatch):
-    monkeypatch.setenv(OUTLINE_CORNERS.variable, "100")
-    with pytest.raises(BadInput, match="feature 2: 102 corners; at most 100"):
-        check(tmp_path, box(300, 0), circle(101))
-
-
-def test_many_equal_buildings(tmp_path, monkeypatch):
-    monkeypatch.setenv(OVERLAPS.variable, "100")
-    with pytest.raises(BadInput, match="pairs of buildings that overlap; at most 100"):
-        check(tmp_path, *[box(0, 0)] * 20)
 
 
 def test_pairs_are_counted_before_they_are_cut(tmp_path, monkeypatch):
@@ -89,24 +81,12 @@ def test_equal_names_are_numbered_in_one_pass():
     assert names[:4] == ["A", "A_2", "A_4", "A_5"] and len(set(names)) == 50_000
 
 
-VRT = "<OGRVRTDataSource><OGRVRTLayer name='x'><SrcDataSource>{}</SrcDataSource></OGRVRTLayer></OGRVRTDataSource>"
-WFS = "<OGRWFSDataSource><URL>http://127.0.0.1:9/</URL></OGRWFSDataSource>"
-
-
 @pytest.fixture
 def package(tmp_path):
     areas = shapely.to_wkb([shapely.box(8.5, 47.4, 8.5002, 47.4001)])
     pyogrio.raw.write(tmp_path / "a.gpkg", areas, [np.array([9])], ["height"], layer="houses",
                       geometry_type="Polygon", crs="EPSG:4326", driver="GPKG")
     return tmp_path / "a.gpkg"
-
-
-@pytest.mark.parametrize("text", [VRT, WFS])
-def test_a_package_that_names_another_source(package, text):
-    path = package.with_name("b.gpkg")
-    path.write_text(text.format(package))
-    with pytest.raises(BadInput, match="not a readable GeoPackage"):
-        read_geopackage(path)
 
 
 def alter(path, *commands):

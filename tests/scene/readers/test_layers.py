@@ -112,9 +112,3 @@ def test_an_archive_of_shapefiles_with_other_things(tmp_path):
 def test_a_file_without_layers(tmp_path, empty_map):
     with pytest.raises(BadInput, match="has no layers; leave --layer out"):
         build_scene(empty_map.box(0, 0, 9, 9).write(tmp_path / "a.osm"), tmp_path / "out", layers=["a"])
-
-
-def test_columns_that_change_nothing_are_told(tmp_path):
-    path = write(tmp_path / "a.gpkg", "houses", areas((0, 0, 20, 20)), height=[9.0], Eigentuemer=["x"], roof_z=[400.0])
-    unused = built(path, tmp_path)[2]
-    assert unused == "tags or columns 'eigentuemer', 'roof_z'"

@@ -51,8 +51,3 @@ def test_bad_tables(tmp_path, text, message):
     (tmp_path / "m.toml").write_text(text)
     with pytest.raises(BadInput, match=message):
         read_material_table(tmp_path / "m.toml")
-
-
-def test_no_table(tmp_path):
-    with pytest.raises(BadInput, match="none.toml does not exist"):
-        read_material_table(tmp_path / "none.toml")

@@ -17,7 +17,6 @@ from radiotwin.scene.meshes import cut_polygon, is_closed
 from radiotwin.scene.readers import build_scene
 from radiotwin.scene.readers.gis_files import area_of_wkb
 from tests.scene.readers import city_models as made
-from tests.terrains import write_dem
 
 SQUARE = shapely.box(8.7, 47.5, 8.7002, 47.5001)
 RING = shapely.get_coordinates(SQUARE)
@@ -64,7 +63,7 @@ def test_corners_in_a_row_stay_in_a_closed_shell(tmp_path):
     assert dict(report.facts)["buildings"] == "1 in 1 blocks"
 
 
-@pytest.mark.parametrize("seed", range(60))
+@pytest.mark.parametrize("seed", range(20))
 def test_broken_shells_end_in_a_message_or_a_scene(tmp_path, seed):
     rng, model = np.random.default_rng(seed), without_semantics()
     shell = surfaces(model)
@@ -243,21 +242,3 @@ def test_many_buildings_in_one_place(tmp_path):
     model["CityObjects"] = {f"B{number}": {"type": "Building", "geometry": part["geometry"]} for number in range(1500)}
     with pytest.raises(BadInput, match="pairs of a building, part or roof and one around it; at most 2,000,000"):
         city(tmp_path, model)
-
-
-@pytest.mark.parametrize("dtype", ["complex_int16", "complex64", "complex128"])
-def test_a_terrain_of_complex_numbers(package, tmp_path, dtype):
-    pytest.importorskip("rasterio")
-    path = tmp_path / "dem.tif"
-    write_dem(path, lambda x, y: 0 * x, dtype="complex64") if dtype != "complex_int16" else _complex_integers(path)
-    with pytest.raises(BadInput, match="pixels of type complex.*, which are no heights"):
-        build_scene(package, tmp_path / "out", terrain=path, check_only=True)
-
-
-def _complex_integers(path):
-    import rasterio
-    from rasterio.transform import from_origin
-
-    with rasterio.open(path, "w", driver="GTiff", width=9, height=9, count=1, dtype="complex_int16", crs="EPSG:4326",
-                       transform=from_origin(8.69, 47.51, 0.01, 0.01)):
-        pass

@@ -19,15 +19,10 @@ def features(tmp_path, text):
 
 @pytest.mark.parametrize(("chains", "rings"), [
     ([[1, 2, 3, 1]], 1), ([[1, 2, 3], [1, 4, 3]], 1), ([[1, 2], [3, 2], [3, 4, 1]], 1),
-    ([[1, 2, 3, 1], [5, 6], [6, 7, 5]], 2), ([], 0), ([[1, 2, 1]], 0)])
+    ([[1, 2, 3, 1], [5, 6], [6, 7, 5]], 2), ([], 0), ([[1, 2, 1]], 0), ([[1, 2, 3]], None), ([[1, 2, 3], [3, 4]], None)])
 def test_ways_make_rings(chains, rings):
     found = stitch(chains)
-    assert len(found) == rings and all(ring[0] == ring[-1] for ring in found)
-
-
-@pytest.mark.parametrize("chains", [[[1, 2, 3]], [[1, 2, 3], [3, 4]]])
-def test_ways_with_an_open_end(chains):
-    assert stitch(chains) is None
+    assert found is None if rings is None else len(found) == rings and all(ring[0] == ring[-1] for ring in found)
 
 
 def test_the_town(town_osm):
@@ -62,14 +57,6 @@ def relation(role, way_tags="", relation_tags='<tag k="type" v="multipolygon"/>'
 def test_old_multipolygons_have_their_tags_at_the_outer_way(tmp_path):
     found = features(tmp_path, relation("outer", '<tag k="building" v="yes"/><tag k="height" v="7"/>'))
     assert list(found) == ["relation/1"] and found["relation/1"].tags["height"] == "7"
-
-
-def test_a_relation_without_its_ways_is_cut(tmp_path):
-    path = tmp_path / "a.osm"
-    path.write_text(relation("outer", "", '<tag k="type" v="multipolygon"/><tag k="building" v="yes"/>'
-                             '<member type="way" ref="5" role="outer"/>'))
-    found = assemble(read_osm_xml(path))
-    assert not found.features and "lack nodes or ways" in found.left_out[0].reason
 
 
 @pytest.mark.parametrize(("text", "message"), [
@@ -122,16 +109,6 @@ def test_rings_without_a_role_are_courtyards_by_where_they_lie(tmp_path, roles, 
                      '<tag k="type" v="multipolygon"/><tag k="building" v="yes"/></relation></osm>')
     assert found["relation/9"].area.area == pytest.approx(area)
     assert ("way/2" in found) == (roles[1] != "outer")
-
-
-def test_ways_of_one_ring_without_roles(tmp_path):
-    nodes, _ = ring(1, 0, 10)
-    halves = ('<way id="1"><nd ref="10"/><nd ref="11"/><nd ref="12"/></way>'
-              '<way id="2"><nd ref="12"/><nd ref="13"/><nd ref="10"/></way>')
-    members = '<member type="way" ref="1" role="outer"/><member type="way" ref="2" role=""/>'
-    found = features(tmp_path, f'<osm>{nodes}{halves}<relation id="9">{members}<tag k="type" v="multipolygon"/>'
-                     '<tag k="building" v="yes"/></relation></osm>')
-    assert [one.area.area for one in found.values()] == [pytest.approx(100)]
 
 
 def overpass(geometry):

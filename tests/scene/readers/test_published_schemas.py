@@ -23,18 +23,13 @@ def geojson(tmp_path, rows):
     return write_geojson(tmp_path / "a.geojson", [(box(x_m), row) for x_m, row in rows])
 
 
-@pytest.mark.parametrize("tags", [
+BELOW = [
     {"location": "underground", "height": "8"}, {"location": "indoor; Underground"},
     {"building": "parking", "parking": "underground"}, {"layer": "-1", "building:levels": "1"}, {"level": "-2;-1"},
     {"level": "-3--1"}, {"tunnel": "yes"}, {"building:levels": "0", "building:levels:underground": "3"},
     {"min_height": "-6", "height": "0"}, {"min_height": "-9", "height": "-3"}, {"is_underground": "True"},
-    {"max_level": "-1", "min_level": "-3"}, {"relativetoterrain": "entirelyBelowTerrain"}, {"ofl": "1200"}, {"relatievehoogteligging": "-1"}])
-def test_what_lies_below_the_ground(tags):
-    found = why_excluded("way/1", {"building": "yes"} | tags, None)
-    assert found is not None and found.reason == UNDERGROUND and found.name.startswith("way/1: ")
-
-
-@pytest.mark.parametrize("tags", [
+    {"max_level": "-1", "min_level": "-3"}, {"relativetoterrain": "entirelyBelowTerrain"}, {"ofl": "1200"}, {"relatievehoogteligging": "-1"}]
+ABOVE = [
     {}, {"location": "roof"}, {"location": "overground;underground"},
     {"building": "apartments", "parking": "underground"},
     {"building": "parking", "parking": "underground", "building:levels": "1"}, {"layer": "1"}, {"layer": "roofs"}, {"layer": "-1", "height": "8"}, {"level": "-1", "amenity": "restaurant", "building:levels": "4"}, {"level": "-1;0"}, {"level": "-1-2"}, {"level": "0-3"},
@@ -42,22 +37,17 @@ def test_what_lies_below_the_ground(tags):
     {"building:levels": "0", "building:levels:underground": "2", "roof:levels": "1"},
     {"building:levels": "0", "building:levels:underground": "2", "height": "4"},
     {"building:levels": "4", "building:levels:underground": "2"}, {"min_height": "-2", "height": "9"},
-    {"is_underground": "False"}, {"relativetoterrain": "substantiallyBelowTerrain"}, {"height": "-3"}])
-def test_what_stands_above_the_ground(tags):
-    assert why_excluded("way/1", {"building": "yes"} | tags, None) is None
+    {"is_underground": "False"}, {"relativetoterrain": "substantiallyBelowTerrain"}, {"height": "-3"},
+    {"building": "construction"}, {"indoor": "yes"}]
 
 
-@pytest.mark.parametrize("tags", [{"building": "proposed"}, {"building:part": "Demolished"}])
-def test_what_does_not_stand(tags):
-    found = why_excluded("way/1", tags | {"height": "9"}, None)
-    assert found is not None and found.reason == NOT_THERE
-    assert why_excluded("way/1", {"building": "construction"}, None) is None
-
-
-def test_rooms_are_inside_of_buildings():
-    found = why_excluded("way/1", {"building:part": "yes", "indoor": "room", "level": "2"}, None)
-    assert found is not None and found.reason == INDOORS
-    assert why_excluded("way/1", {"building": "yes", "indoor": "yes"}, None) is None
+@pytest.mark.parametrize(("tags", "reason"), [
+    *((tags, UNDERGROUND) for tags in BELOW), *((tags, None) for tags in ABOVE),
+    ({"building": "proposed", "height": "9"}, NOT_THERE), ({"building": "", "building:part": "Demolished"}, NOT_THERE),
+    ({"building": "", "building:part": "yes", "indoor": "room", "level": "2"}, INDOORS)])
+def test_what_stands_above_the_ground(tags, reason):
+    found = why_excluded("way/1", {"building": "yes"} | tags, None)
+    assert (found and found.reason) == reason and (found is None or found.name.startswith("way/1: "))
 
 
 def test_what_lies_below_is_left_out_and_told_and_does_not_replace_what_stands_above(tmp_path, empty_map):
@@ -94,11 +84,6 @@ def test_parts_of_overture_replace_their_building(tmp_path):
     assert table["top_m"].to_dict() == {"feature 2": 12.0}
     table, told = built(tmp_path, geojson(tmp_path, [(0, whole)]))
     assert table["top_m"].to_dict() == {"feature 1": 40.0} and "parts (has_parts) that the file does not hold" in told
-
-
-def test_a_building_id_of_a_city_makes_no_part(tmp_path):
-    table, _ = built(tmp_path, geojson(tmp_path, [(0, {"building_id": 7, "height": 9})]))
-    assert table["top_m"].to_dict() == {"feature 1": 9.0}
 
 
 def test_the_highest_storey_of_indoor_tagging(tmp_path, empty_map):

@@ -59,6 +59,11 @@ def test_a_courtyard_whichever_way_rings_turn(tmp_path, turn, courtyard_turn):
     assert area_m2(one) == pytest.approx(300, rel=2e-3) and one.area.is_valid
 
 
+def test_text_of_another_code_page(tmp_path):
+    path = write(tmp_path, shapely.Polygon(SQUARE), encoding="CP1252", name=np.array(["Straße"], dtype=object))
+    assert read_shapefile(path).features[0].tags["name"] == "Straße"
+
+
 def test_an_archive_holds_the_same(town, tmp_path):
     with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as archive:
         for suffix in PARTS:
@@ -68,18 +73,46 @@ def test_an_archive_holds_the_same(town, tmp_path):
     assert all(one.area.equals(other.area) for one, other in zip(found, plain))
 
 
-def test_text_of_another_code_page(tmp_path):
-    path = write(tmp_path, shapely.Polygon(SQUARE), encoding="CP1252", name=np.array(["Straße"], dtype=object))
-    assert read_shapefile(path).features[0].tags["name"] == "Straße"
+def damaged(suffix, offset, number):
+    def change(town):
+        path = town.with_suffix(suffix)
+        data = bytearray(path.read_bytes())
+        data[offset:offset + len(number)] = number
+        path.write_bytes(data)
+    return change
 
 
-@pytest.mark.parametrize(("suffix", "message"), [
-    (".dbf", "the Shapefile a has no .dbf; keep its .shp, .dbf and .prj together"),
-    (".prj", "the Shapefile a has no .prj, which names its coordinate reference system")])
-def test_a_missing_part(town, suffix, message):
-    town.with_suffix(suffix).unlink()
+WITH_GRIDS = 'PROJCS["x",EXTENSION["PROJ4","+proj=latlong +nadgrids=/etc/passwd"]]'
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    (lambda town: town.with_suffix(".dbf").unlink(), "the Shapefile a has no .dbf; keep its .shp, .dbf and .prj together"),
+    (lambda town: town.with_suffix(".prj").unlink(), "the Shapefile a has no .prj, which names its coordinate reference system"),
+    (lambda town: town.with_suffix(".prj").write_text(WITH_GRIDS), "WKT without grids"),
+    (lambda town: write(town.parent, shapely.LineString(SQUARE), geometry_type="LineString"), "type 3, which is none of poly"),
+    *((lambda town, at=at: town.write_bytes(town.read_bytes()[:at]), "cut off or damaged|its .shp begins otherwise")
+      for at in (50, 101, 150, -1)),
+    (damaged(".shp", 104, struct.pack(">i", -60)), "shape 1 is cut off"),  # a record that leads backwards
+    (damaged(".shp", 144, struct.pack("<i", 2**31 - 1)), "not a readable Shapefile"),  # rings
+    (damaged(".shp", 148, struct.pack("<i", 2**31 - 1)), "not a readable Shapefile"),  # corners
+    (damaged(".shp", 152, struct.pack("<i", -7)), "a part begins outside"),
+    (damaged(".shp", 160, struct.pack("<d", float("nan"))), "not finite"),
+    (damaged(".dbf", 4, struct.pack("<I", 2**32 - 1)), "2 shapes, but 4,294,967,295 rows")])
+def test_what_is_no_shapefile(town, change, message):
+    change(town)
     with pytest.raises(BadInput, match=message):
         read_shapefile(town)
+
+
+@pytest.mark.parametrize("data", [b"", b"PK\x03\x04", b"not an archive", None])
+def test_what_is_no_archive_of_shapefiles(tmp_path, data):
+    if data is None:
+        with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+            archive.writestr("../../etc/readme.txt", "x")
+    else:
+        (tmp_path / "a.zip").write_bytes(data)
+    with pytest.raises(BadInput, match="holds no .shp file" if data is None else "not a readable ZIP archive"):
+        read_shapefile(tmp_path / "a.zip")
 
 
 def test_a_link_out_of_the_folder(town, tmp_path):
@@ -92,35 +125,6 @@ def test_a_link_out_of_the_folder(town, tmp_path):
         read_shapefile(tmp_path / "in" / "a.shp")
 
 
-def test_lines_are_no_buildings(tmp_path):
-    path = write(tmp_path, shapely.LineString(SQUARE), geometry_type="LineString")
-    with pytest.raises(BadInput, match="type 3, which is none of polygons"):
-        read_shapefile(path)
-
-
-@pytest.mark.parametrize("at", [50, 101, 150, -1])
-def test_cut_off(town, at):
-    town.write_bytes(town.read_bytes()[:at])
-    with pytest.raises(BadInput, match="cut off or damaged|its .shp begins otherwise"):
-        read_shapefile(town)
-
-
-@pytest.mark.parametrize(("suffix", "offset", "number", "message"), [
-    (".shp", 104, struct.pack(">i", -60), "shape 1 is cut off"),  # a record that leads backwards
-    (".shp", 144, struct.pack("<i", 2**31 - 1), "not a readable Shapefile"),  # rings
-    (".shp", 148, struct.pack("<i", 2**31 - 1), "not a readable Shapefile"),  # corners
-    (".shp", 152, struct.pack("<i", -7), "a part begins outside"),
-    (".shp", 160, struct.pack("<d", float("nan")), "not finite"),
-    (".dbf", 4, struct.pack("<I", 2**32 - 1), "2 shapes, but 4,294,967,295 rows")])
-def test_damaged_numbers(town, suffix, offset, number, message):
-    path = town.with_suffix(suffix)
-    data = bytearray(path.read_bytes())
-    data[offset:offset + len(number)] = number
-    path.write_bytes(data)
-    with pytest.raises(BadInput, match=message):
-        read_shapefile(town)
-
-
 def test_budgets(town, tmp_path, monkeypatch):
     with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("a.shp", bytes(10_000_000))
@@ -129,24 +133,4 @@ def test_budgets(town, tmp_path, monkeypatch):
         read_shapefile(tmp_path / "a.zip")
     monkeypatch.setenv(FEATURES.variable, "1")
     with pytest.raises(BadInput, match="2 buildings; at most 1"):
-        read_shapefile(town)
-
-
-@pytest.mark.parametrize("data", [b"", b"PK\x03\x04", b"not an archive"])
-def test_broken_archives(tmp_path, data):
-    (tmp_path / "a.zip").write_bytes(data)
-    with pytest.raises(BadInput, match="not a readable ZIP archive"):
-        read_shapefile(tmp_path / "a.zip")
-
-
-def test_an_archive_of_something_else(tmp_path):
-    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
-        archive.writestr("../../etc/readme.txt", "x")
-    with pytest.raises(BadInput, match="holds no .shp file"):
-        read_shapefile(tmp_path / "a.zip")
-
-
-def test_a_system_that_names_a_file(town):
-    town.with_suffix(".prj").write_text('PROJCS["x",EXTENSION["PROJ4","+proj=latlong +nadgrids=/etc/passwd"]]')
-    with pytest.raises(BadInput, match="WKT without grids"):
         read_shapefile(town)

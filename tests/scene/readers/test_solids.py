@@ -31,28 +31,21 @@ def total_volume(blocks):
     return sum(block.mesh.volume for block in blocks)
 
 
-def test_a_courtyard_stays_open():
-    area = shapely.box(0, 0, 40, 30).difference(shapely.box(10, 10, 30, 20))
+COURTYARD = shapely.box(0, 0, 40, 30).difference(shapely.box(10, 10, 30, 20))
+BOW_TIE = shapely.Polygon([(0, 0), (20, 10), (20, 0), (0, 10)])
+AT_THE_WALL = shapely.Polygon([(0, 0), (20, 0), (20, 20), (0, 20)], [[(0, 10), (10, 5), (10, 15)]])  # a courtyard
+CORNERS = shapely.MultiPolygon([shapely.box(0, 0, 10, 10), shapely.box(10, 10, 20, 20)])
+
+
+@pytest.mark.parametrize(("area", "blocks", "area_m2", "is_fixed"), [
+    (COURTYARD, 1, 1000, False), (BOW_TIE, 2, 100, True), (AT_THE_WALL, 1, 350, True), (CORNERS, 2, 200, False)],
+    ids=["courtyard", "bow tie", "courtyard at the wall", "corners"])
+def test_outlines_become_watertight_solids(area, blocks, area_m2, is_fixed):
     prisms, problems = prisms_of(feature(area))
-    (block,) = make_blocks(prisms, find_contacts(prisms))
-    assert block.mesh.is_watertight and block.mesh.euler_number == 0  # a ring: one hole
-    assert block.mesh.volume == pytest.approx(10 * (1200 - 200), rel=1e-3) and not problems
-
-
-def test_a_bow_tie_becomes_two_triangles():
-    prisms, problems = prisms_of(feature(shapely.Polygon([(0, 0), (20, 10), (20, 0), (0, 10)])))
-    assert len(prisms) == 2 and problems[0].severity == "fixed" and "way/1" in problems[0].message
-    blocks = make_blocks(prisms, find_contacts(prisms))
-    assert len(blocks) == 2 and all(block.mesh.is_watertight for block in blocks)
-    assert total_volume(blocks) == pytest.approx(10 * 100, rel=5e-3)
-
-
-def test_a_courtyard_that_touches_the_outside_wall():
-    area = shapely.Polygon([(0, 0), (20, 0), (20, 20), (0, 20)], [[(0, 10), (10, 5), (10, 15)]])
-    prisms, problems = prisms_of(feature(area))
-    blocks = make_blocks(prisms, find_contacts(prisms))
-    assert all(block.mesh.is_watertight for block in blocks) and problems
-    assert total_volume(blocks) == pytest.approx(10 * 350, rel=0.01)
+    found = make_blocks(prisms, find_contacts(prisms))
+    assert len(found) == blocks and all(block.mesh.is_watertight for block in found)
+    assert total_volume(found) == pytest.approx(10 * area_m2, rel=0.01)
+    assert [(problem.severity, "way/1" in problem.message) for problem in problems] == [("fixed", True)] * is_fixed
 
 
 @pytest.mark.parametrize(("parts", "area_m2"), [
@@ -66,13 +59,12 @@ def test_parts_of_an_outline_that_overlap_are_united(parts, area_m2):
     assert problem.severity == "fixed" and "overlap or lie in each other: united ('way/1')" in problem.message
 
 
-@pytest.mark.parametrize(("area", "message"), [
-    (shapely.Polygon([(0, 0), (10, 0), (20, 0)]), "no area"),
-    (shapely.Polygon([(0, 0), (0, 0), (0, 0), (0, 0)]), "no area"),
-    (shapely.box(0, 0, 30, 0.1), "sliver"),
-    (shapely.box(0, 0, 0.9, 0.9), "sliver")])
-def test_omissions_are_reported(area, message):
-    prisms, problems = prisms_of(feature(area), feature(shapely.box(50, 50, 60, 60), "way/2"))
+@pytest.mark.parametrize(("area", "tags", "message"), [
+    (shapely.Polygon([(0, 0), (10, 0), (20, 0)]), {}, "no area"), (shapely.Polygon([(0, 0)] * 4), {}, "no area"),
+    (shapely.box(0, 0, 30, 0.1), {}, "sliver"), (shapely.box(0, 0, 0.9, 0.9), {}, "sliver"),
+    (shapely.box(0, 0, 9, 9), {"min_height": "10"}, "no lower than they end")])
+def test_omissions_are_reported(area, tags, message):
+    prisms, problems = prisms_of(feature(area, **tags), feature(shapely.box(50, 50, 60, 60), "way/2"))
     assert {prism.name for prism in prisms} == {"way/2"}
     assert len(problems) == 1 and message in problems[0].message and "'way/1'" in problems[0].message
 
@@ -92,11 +84,6 @@ def test_neighbours_of_other_materials_have_a_slot_between_them():
     assert {wall.material.name, other.material.name} == {"concrete", "wood"}
     assert wall.mesh.is_watertight and other.mesh.is_watertight
     assert other.mesh.bounds[0, 0] - wall.mesh.bounds[1, 0] == pytest.approx(SLOT_M, abs=2e-3)
-
-
-def test_buildings_that_meet_in_a_corner_stay_apart():
-    prisms, _ = prisms_of(feature(shapely.box(0, 0, 10, 10)), feature(shapely.box(10, 10, 20, 20)))
-    assert [block.mesh.is_watertight for block in make_blocks(prisms, find_contacts(prisms))] == [True, True]
 
 
 def test_overlaps_are_found_and_built_once():
@@ -143,16 +130,8 @@ def test_a_building_that_does_not_reach_the_ground_is_named(bottoms_m):
     named = [problem.message for problem in problems if "nothing of them reaches it" in problem.message]
     assert len(named) == (low_m > 2.5)
     assert all(text.startswith("1 building(s) begin more than 2.5 m") and "('way/1')" in text for text in named)
-
-
-def test_what_a_lone_part_stands_on_is_not_known():
+    # What a lone part stands on is not known
     assert not prisms_of(part(shapely.box(0, 0, 30, 10), "way/2", height="40", min_height="10"))[1]
-
-
-def test_a_bottom_above_the_top_is_left_out():
-    prisms, problems = prisms_of(feature(shapely.box(0, 0, 9, 9), min_height="10"),
-                                 feature(shapely.box(20, 0, 29, 9), "way/2"))
-    assert [prism.name for prism in prisms] == ["way/2"] and "no lower than they end" in problems[0].message
 
 
 rectangles = st.tuples(*[st.integers(0, 12)] * 2, *[st.integers(1, 8)] * 2, st.integers(1, 4),

@@ -1,6 +1,5 @@
 """Woods, parks and rows of trees of OpenStreetMap become volumes of a scene."""
 
-import osmium
 import pytest
 import shapely
 
@@ -9,7 +8,7 @@ from radiotwin.scene.build import BuildOptions
 from radiotwin.scene.config import read_config
 from radiotwin.scene.readers import build_scene_from_map
 from radiotwin.scene.readers.features import left_out_problems
-from radiotwin.scene.readers.osm import assemble, read_osm_pbf, read_osm_xml
+from radiotwin.scene.readers.osm import assemble, read_osm_xml
 
 STEP_DEG = 0.001  # 111 m to the north, 75 m to the east at 47.5 degrees
 
@@ -53,17 +52,6 @@ def test_what_grows_is_found_and_what_is_incomplete_is_told(area_osm):
     assert {feature.name for feature in found.features} == {"way/1", "way/9"}
     (problem,) = [each.message for each in left_out_problems(found.left_out, None) if "vegetation" in each.message]
     assert "2 area(s)" in problem and "'way/8'" in problem and "'relation/2'" in problem
-
-
-def test_pbf_holds_the_same(area_osm, tmp_path):
-    path = tmp_path / "area.osm.pbf"
-    with osmium.SimpleWriter(str(path)) as writer:
-        for element in osmium.FileProcessor(str(area_osm)):
-            writer.add(element)
-    one, other = (sorted(assemble(elements).vegetation, key=lambda each: each.name)
-                  for elements in (read_osm_xml(area_osm), read_osm_pbf(path)))
-    assert [each.name for each in one] == [each.name for each in other]
-    assert all(shapely.equals_exact(a.area, b.area, 1e-9) for a, b in zip(one, other))
 
 
 def test_a_scene_declares_it(area_osm, tmp_path):
