@@ -1,10 +1,14 @@
-"""Small cities, written by hand as ASCII PLY and XML, so that no writer of the package is trusted by its own tests."""
+"""Small cities; files by hand as ASCII PLY and XML, so that no writer of the package is trusted by its own tests."""
 
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
+
+from radiotwin.scene.citymap import CityMap
+from radiotwin.scene.presets import building_meshes
 
 CUBE_CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
 CUBE_QUADS = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]  # outwards
@@ -23,6 +27,12 @@ def box_mesh(x, y, z=(0.0, 10.0)):
 def plane_mesh(half=100.0, z=0.0):
     corners = np.array([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]])
     return corners, [[0, 1, 2], [0, 2, 3]]
+
+
+def city_of(boxes, **more):
+    """The 3D map of boxes (x_min, y_min, x_max, y_max, height) on z = 0, those that touch united."""
+    mesh = trimesh.util.concatenate(building_meshes(np.array(boxes, dtype=float)))
+    return CityMap(mesh.vertices, mesh.faces, **more)
 
 
 def ascii_ply(vertices, faces) -> str:

@@ -5,13 +5,9 @@ import pytest
 import trimesh
 
 from radiotwin.scene.citymap import CityMap
-from radiotwin.scene.presets import building_meshes, preset_boxes
+from radiotwin.scene.presets import preset_boxes
+from tests.scene.conftest import city_of
 from tests.terrains import incline, terrain_map
-
-
-def city_of(boxes) -> CityMap:
-    mesh = trimesh.util.concatenate(building_meshes(np.array(boxes, dtype=float)))
-    return CityMap(mesh.vertices, mesh.faces)
 
 
 def clip_interval(a_m, b_m, box):

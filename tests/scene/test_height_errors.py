@@ -10,7 +10,7 @@ from radiotwin.effects.catalogue.missing_obstacle import _with_box
 from radiotwin.errors import BadInput
 from radiotwin.io.content_hash import content_hash
 from radiotwin.scene.citymap import CityMap, shape_height_sds_m
-from radiotwin.scene.presets import building_meshes
+from tests.scene.conftest import city_of
 
 
 def table(folder, *rows, header="building,shape,area_m2,height_sd_m"):
@@ -41,19 +41,13 @@ def test_a_table_elsewhere_is_not_read(tmp_path):
 
 
 def test_maps_made_from_a_map_keep_it():
-    shapes = building_meshes(np.array([[0.0, 0.0, 20.0, 20.0, 15.0], [50.0, 0.0, 80.0, 20.0, 25.0]]))
-    vertices = np.vstack([shape.vertices for shape in shapes])
-    starts = np.cumsum([0, *(len(shape.vertices) for shape in shapes)])
-    faces = np.vstack([shape.faces + start for shape, start in zip(shapes, starts)])
-    sd_m = np.repeat([1.5, 6.0], [len(shape.faces) for shape in shapes[-2:]])
-    sd_m = np.concatenate([np.full(len(faces) - len(sd_m), np.nan), sd_m])
-    city = CityMap(vertices, faces, height_sd_m=sd_m)
-    gone = sd_m == 1.5
-    assert city.without(gone).height_sd_m == pytest.approx(sd_m[~gone], nan_ok=True)
-    for same in (city.with_vertices(vertices + 1.0), pickle.loads(pickle.dumps(city))):
-        assert same.height_sd_m == pytest.approx(sd_m, nan_ok=True)
+    sd_m, terrain = np.repeat([1.5, 6.0], 12), np.repeat([True, False], 12)
+    city = city_of([(0, 0, 20, 20, 15), (50, 0, 80, 20, 25)], height_sd_m=sd_m, terrain=terrain)
+    assert set(city.without(sd_m == 1.5).height_sd_m) == {6.0}
+    for same in (city.with_vertices(city.vertices + 1.0), pickle.loads(pickle.dumps(city))):
+        assert (same.height_sd_m == sd_m).all() and (same.terrain == terrain).all()
     more = _with_box(city, Box(100.0, 0.0, 10.0, 10.0, 12.0, 0.0))
-    assert len(more.height_sd_m) == len(more.faces) and np.isnan(more.height_sd_m[len(faces):]).all()
+    assert len(more.height_sd_m) == len(more.faces) and np.isnan(more.height_sd_m[24:]).all()
 
 
 def test_what_was_fitted_with_other_errors_is_not_taken_for_this():

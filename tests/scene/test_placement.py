@@ -13,24 +13,19 @@ from radiotwin.scene.placement import (
     place_devices,
     place_uavs,
 )
+from tests.scene.conftest import city_of
 
 EXTENT = Extent(x_min_m=-100, x_max_m=100, y_min_m=0, y_max_m=300)
-HOUSES = [(-80, -40, 40, 120, 30.0), (0, 60, 40, 80, 20.0), (-20, 20, 130, 170, 80.0)]  # x0, x1, y0, y1, height
+HOUSES = [(-80, 40, -40, 120, 30.0), (0, 40, 60, 80, 20.0), (-20, 130, 20, 170, 80.0)]  # x0, y0, x1, y1, height
 
 
 @pytest.fixture(scope="module")
 def buildings():
-    corners, faces = [], []
-    for x0, x1, y0, y1, top in HOUSES:
-        start = len(corners)
-        corners += [(x, y, z) for z in (0, top) for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))]
-        for a, b, c, d in ((4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)):
-            faces += [(start + a, start + b, start + c), (start + a, start + c, start + d)]
-    return CityMap(np.array(corners, dtype=float), np.array(faces))
+    return city_of(HOUSES)
 
 
 def gap(device, house):
-    x0, x1, y0, y1, _ = house
+    x0, y0, x1, y1, _ = house
     return np.hypot(max(x0 - device.x_m, 0, device.x_m - x1), max(y0 - device.y_m, 0, device.y_m - y1))
 
 

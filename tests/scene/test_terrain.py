@@ -1,6 +1,5 @@
 """The ground as a terrain: its triangles, and what the 3D map, placement and lattices make of it."""
 
-import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -122,10 +121,3 @@ def test_vegetation_stands_on_the_slope():
     assert found_m == pytest.approx([40 * np.hypot(1, 0.5), 0, 0], abs=2.5)
     level = np.array([[-100.0, 0, 108.0]]), np.array([[100.0, 0, 108.0]])  # through x = -16 … 16 m of it
     assert wood.metres_through(*level, city.ground_height_m) == pytest.approx([32], abs=2.5)
-
-
-def test_a_map_that_goes_to_another_process_keeps_its_terrain():
-    city = terrain_map(ridge(30.0))
-    other = pickle.loads(pickle.dumps(city))
-    np.testing.assert_array_equal(other.terrain, city.terrain)
-    assert other.ground_height_m(30.0, 40.0) == city.ground_height_m(30.0, 40.0)

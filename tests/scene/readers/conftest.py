@@ -1,7 +1,10 @@
 import json
 from pathlib import Path
 
+import numpy as np
+import pyogrio
 import pytest
+import shapely
 
 TOWN = Path(__file__).with_name("town.osm")
 
@@ -30,6 +33,14 @@ def write_geojson(path, rows, **more):
     """Write outlines with their columns, (ring, properties) each."""
     features = [polygon(outline, properties) for outline, properties in rows]
     path.write_text(json.dumps({"type": "FeatureCollection", "features": features} | more))
+    return path
+
+
+def write_table(path, areas, crs="EPSG:4326", layer=None, kind="Polygon", **columns):
+    """Write a layer of a GeoPackage, or a Shapefile, with the columns' values by name, as GDAL does."""
+    values = [np.array(column, dtype=object if isinstance(column[0], str) else None) for column in columns.values()]
+    pyogrio.raw.write(path, shapely.to_wkb(list(areas)), values, list(columns), layer=layer, geometry_type=kind, crs=crs,
+                      driver="GPKG" if path.suffix == ".gpkg" else "ESRI Shapefile", append=path.exists())
     return path
 
 

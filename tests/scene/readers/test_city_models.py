@@ -2,7 +2,6 @@
 
 import gzip
 import json
-from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -14,15 +13,11 @@ from pyproj import Transformer
 from radiotwin.errors import BadInput
 from radiotwin.geo import to_local
 from radiotwin.io.budgets import TAG_BYTES, VERTICES
-from radiotwin.io.forms import Origin
 from radiotwin.scene import Scene
 from radiotwin.scene.build import BuildOptions
-from radiotwin.scene.materials import STANDARD
 from radiotwin.scene.readers import build_scene_from_map
 from radiotwin.scene.readers.citygml import read_citygml
-from radiotwin.scene.readers.extrude import make_blocks
 from radiotwin.scene.readers.gis_files import read_json_map
-from radiotwin.scene.readers.solids import find_contacts, make_shell_prisms
 from tests.scene.readers import city_models as made
 
 HOUSES = [(0, 0, 1.2), (10, 0, 1.5), (40, 0, 1.2)]  # the first two share a wall
@@ -336,17 +331,6 @@ def test_roofs_of_a_material_of_their_own(tmp_path):
     # Two slopes a house, of 5 m to 3 m of height: sqrt(34) wide and 12 m long
     assert sum(mesh.area for mesh in roofs) == pytest.approx(3 * 2 * 34**0.5 * 12, rel=2e-3)
     assert any("nothing diffracts there" in problem.message for problem in report.problems)
-
-
-def test_a_body_stands_where_its_prism_does(tmp_path):
-    """As on terrain: 5 m up, with walls that reach 1 m below its own."""
-    (feature,) = read_json_map(write(tmp_path, made.cityjson([(0, 0, 1.2)]))).features
-    origin = Origin(latitude_deg=52.0, longitude_deg=4.37)
-    (prism,), _ = make_shell_prisms([feature], origin, STANDARD)
-    raised = replace(prism, height=replace(prism.height, bottom_m=4.0, top_m=14.0))
-    (block,) = make_blocks([raised], find_contacts([raised]))
-    assert block.mesh.is_volume and block.mesh.bounds[:, 2] == pytest.approx([4, 14], abs=1e-3)
-    assert block.mesh.volume == pytest.approx(made.VOLUME_M3 + 120, rel=2e-3)
 
 
 def test_a_text_without_an_end(tmp_path, monkeypatch):

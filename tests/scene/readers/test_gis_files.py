@@ -1,13 +1,13 @@
 import json
 
 import numpy as np
-import pyogrio
 import pytest
 import shapely
 
 from radiotwin.errors import BadInput
 from radiotwin.scene.readers.features import left_out_problems
 from radiotwin.scene.readers.gis_files import read_geojson, read_geopackage
+from tests.scene.readers.conftest import write_table
 
 SQUARE = [[8.7, 47.5], [8.7002, 47.5], [8.7002, 47.5001], [8.7, 47.5001], [8.7, 47.5]]
 
@@ -71,12 +71,9 @@ def test_broken_geojson(tmp_path, text, message):
 def package(tmp_path):
     """A GeoPackage in UTM, of a square of 20 m and a point."""
     utm = np.array([[0, 0], [20, 0], [20, 20], [0, 20]]) + [477_400, 5_261_000]
-    areas = shapely.to_wkb([shapely.Polygon(utm), shapely.Polygon(utm + 50)])
     others = ['"building"=>"yes","height"=>"9"', '"building"=>"yes","building:levels"=>"3"']
-    pyogrio.raw.write(tmp_path / "a.gpkg", areas, [np.array([12.5, np.nan]), np.array(others, dtype=object)],
-                      ["height", "other_tags"], layer="houses", geometry_type="Polygon", crs="EPSG:32632",
-                      driver="GPKG")
-    return tmp_path / "a.gpkg"
+    return write_table(tmp_path / "a.gpkg", [shapely.Polygon(utm), shapely.Polygon(utm + 50)], "EPSG:32632",
+                       height=[12.5, np.nan], other_tags=others)
 
 
 def test_a_geopackage_in_another_system(package):

@@ -3,8 +3,6 @@
 import math
 import sqlite3
 
-import numpy as np
-import pyogrio
 import pytest
 import shapely
 
@@ -14,7 +12,7 @@ from radiotwin.scene.materials import Names
 from radiotwin.scene.readers import build_scene_from_map, overpass
 from radiotwin.scene.readers.gis_files import _other_tags, read_geopackage
 from radiotwin.scene.readers.osm import stitch
-from tests.scene.readers.conftest import box, ring, write_geojson
+from tests.scene.readers.conftest import box, ring, write_geojson, write_table
 
 
 def check(tmp_path, *rings, **more):
@@ -83,10 +81,7 @@ def test_equal_names_are_numbered_in_one_pass():
 
 @pytest.fixture
 def package(tmp_path):
-    areas = shapely.to_wkb([shapely.box(8.5, 47.4, 8.5002, 47.4001)])
-    pyogrio.raw.write(tmp_path / "a.gpkg", areas, [np.array([9])], ["height"], layer="houses",
-                      geometry_type="Polygon", crs="EPSG:4326", driver="GPKG")
-    return tmp_path / "a.gpkg"
+    return write_table(tmp_path / "a.gpkg", [shapely.box(8.5, 47.4, 8.5002, 47.4001)], layer="houses", height=[9])
 
 
 def alter(path, *commands):

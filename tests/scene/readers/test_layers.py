@@ -4,12 +4,12 @@ import zipfile
 
 import numpy as np
 import pandas as pd
-import pyogrio
 import pytest
 import shapely
 
 from radiotwin.errors import BadInput
 from radiotwin.scene.readers import build_scene
+from tests.scene.readers.conftest import write_table
 
 AT = np.array([477_400.0, 5_261_000.0])  # in UTM zone 32
 
@@ -19,11 +19,8 @@ def areas(*boxes, three=False):
     return [shapely.force_3d(area, 7.0) for area in found] if three else found
 
 
-def write(path, layer, shapes, crs="EPSG:32632", kind="Polygon", **columns):
-    values = [np.array(column, dtype=object if isinstance(column[0], str) else None) for column in columns.values()]
-    pyogrio.raw.write(path, shapely.to_wkb(shapes), values, list(columns), layer=layer, geometry_type=kind, crs=crs,
-                      driver="GPKG" if path.suffix == ".gpkg" else "ESRI Shapefile", append=path.exists())
-    return path
+def write(path, layer, shapes, **more):
+    return write_table(path, shapes, "EPSG:32632", layer, **more)
 
 
 def built(source, tmp_path, **options):

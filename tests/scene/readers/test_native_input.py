@@ -17,6 +17,7 @@ from radiotwin.scene.meshes import cut_polygon, is_closed
 from radiotwin.scene.readers import build_scene
 from radiotwin.scene.readers.gis_files import area_of_wkb
 from tests.scene.readers import city_models as made
+from tests.scene.readers.conftest import write_table
 
 SQUARE = shapely.box(8.7, 47.5, 8.7002, 47.5001)
 RING = shapely.get_coordinates(SQUARE)
@@ -196,12 +197,8 @@ def test_curves_and_what_is_not_finite_are_no_area():
 @pytest.fixture(scope="module")
 def package(tmp_path_factory):
     """Two buildings in a GeoPackage."""
-    pyogrio = pytest.importorskip("pyogrio")
-    path = tmp_path_factory.mktemp("package") / "town.gpkg"
-    pyogrio.raw.write(
-        path, np.array(shapely.to_wkb([SQUARE, shapely.transform(SQUARE, lambda xy: xy + 0.001)]), dtype=object),
-        [np.array([9.0, 12.0])], ["height"], driver="GPKG", crs="EPSG:4326", geometry_type="Polygon", layer="houses")
-    return path
+    return write_table(tmp_path_factory.mktemp("package") / "town.gpkg", [
+        SQUARE, shapely.transform(SQUARE, lambda xy: xy + 0.001)], layer="houses", height=[9.0, 12.0])
 
 
 def changed(package, tmp_path, *blobs):

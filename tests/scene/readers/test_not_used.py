@@ -8,14 +8,12 @@ import json
 import random
 import string
 
-import numpy as np
-import pyogrio
 import pytest
 import shapely
 
 from radiotwin.scene.readers import build_scene
 from tests.scene.readers import city_models
-from tests.scene.readers.conftest import Map, box
+from tests.scene.readers.conftest import Map, box, write_table
 
 VALUES = (7, -3.5, "text", True)
 SQUARE = shapely.Polygon(box(0))
@@ -33,12 +31,9 @@ def write_lines(path, columns):
     path.write_text(json.dumps(feature(columns)))
 
 
-def write_table(path, columns):
-    values = [np.array([9.0]), *(np.array([value], dtype=object if isinstance(value, str) else None)
-                                 for value in columns.values())]
-    pyogrio.raw.write(path, shapely.to_wkb([SQUARE]), values, ["height", *columns],
-                      geometry_type="Polygon Z" if SQUARE.has_z else "Polygon",
-                      crs="EPSG:4326", driver="GPKG" if path.suffix == ".gpkg" else "ESRI Shapefile")
+def write_geo_table(path, columns):
+    write_table(path, [SQUARE], kind="Polygon Z" if SQUARE.has_z else "Polygon", height=[9.0],
+                **{name: [value] for name, value in columns.items()})
 
 
 def write_parquet(path, columns):
@@ -69,8 +64,8 @@ def write_cityjson(path, columns):
 
 
 @pytest.mark.parametrize(("name", "write"), [
-    ("a.geojson", write_geojson), ("a.json", write_geojson), ("a.geojsonl", write_lines), ("a.gpkg", write_table),
-    ("a.shp", write_table), ("a.parquet", write_parquet), ("a.osm", write_osm), ("b.json", write_overpass),
+    ("a.geojson", write_geojson), ("a.json", write_geojson), ("a.geojsonl", write_lines), ("a.gpkg", write_geo_table),
+    ("a.shp", write_geo_table), ("a.parquet", write_parquet), ("a.osm", write_osm), ("b.json", write_overpass),
     ("a.city.json", write_cityjson)])
 def test_a_column_of_any_name_is_told(tmp_path, name, write):
     rng = random.Random(name)
@@ -93,7 +88,7 @@ def test_nested_and_empty_columns_are_told(tmp_path, name, write):
 
 @pytest.mark.parametrize("z_m", [0.0, 512.5])
 @pytest.mark.parametrize(("name", "write"), [
-    ("a.geojson", write_geojson), ("a.gpkg", write_table), ("a.shp", write_table), ("a.parquet", write_parquet)])
+    ("a.geojson", write_geojson), ("a.gpkg", write_geo_table), ("a.shp", write_geo_table), ("a.parquet", write_parquet)])
 def test_elevations_in_the_coordinates_are_told(tmp_path, monkeypatch, name, write, z_m):
     monkeypatch.setitem(globals(), "SQUARE", shapely.force_3d(SQUARE, z_m))
     write(tmp_path / name, {})

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pandas as pd
-import pyogrio
 import pytest
 import shapely
 
@@ -11,6 +10,7 @@ from radiotwin.io.forms import Origin
 from radiotwin.scene.readers import build_scene
 from radiotwin.scene.readers.plausible import steep_steps, zero_voids
 from radiotwin.scene.readers.terrain import read_heights
+from tests.scene.readers.conftest import write_table
 from tests.scene.readers.test_published_schemas import built, geojson
 from tests.terrains import write_dem
 
@@ -37,9 +37,7 @@ def test_heights_that_no_city_has_are_told(tmp_path, heights, more, said):
 def houses_in_feet(tmp_path):
     """A house of 100 by 100 feet in a plan of New York in feet, with a height without unit."""
     area = shapely.transform(shapely.box(0, 0, 100, 100), lambda points: points + [990_000, 200_000])
-    pyogrio.raw.write(tmp_path / "a.gpkg", shapely.to_wkb([area]), [np.array([100.0])], ["HEIGHT"], layer="houses",
-                      geometry_type="Polygon", crs="EPSG:2263", driver="GPKG")
-    return tmp_path / "a.gpkg"
+    return write_table(tmp_path / "a.gpkg", [area], "EPSG:2263", HEIGHT=[100.0])
 
 
 def test_heights_without_unit_in_a_plan_in_feet_are_asked_for(houses_in_feet, tmp_path):

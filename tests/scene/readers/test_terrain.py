@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import trimesh
 
 from radiotwin.errors import BadInput
 from radiotwin.io.budgets import TERRAIN_BLOCK_BYTES, TERRAIN_PIXELS
@@ -87,6 +88,8 @@ def test_parts_of_a_city_model_stand_on_the_ground_of_their_building(tmp_path):
     assert table["ground_m"].tolist() == pytest.approx([low_m] * 2, abs=0.1)
     assert table["bottom_m"].tolist() == pytest.approx([low_m - 1, low_m + 5], abs=0.1)
     assert table["top_m"].tolist() == pytest.approx([low_m + made.RIDGE_M, low_m + 5 + made.RIDGE_M], abs=0.1)
+    house, = (trimesh.load(path, process=False) for path in (report.folder / "meshes").glob("B0*.ply") if path.stem == "B0")
+    assert house.is_volume and house.bounds[0, 2] == pytest.approx(low_m - 1, abs=0.1)
 
 
 def test_the_scene_knows_its_ground(slope):
