@@ -223,8 +223,13 @@ class SceneConfig(Table):
         if len({uav.antenna for uav in self.uavs}) > 1:
             raise ValueError("uavs have different antennas; one radio map serves all of them, so "
                              "give all the same")
+        x_min_m, x_max_m, y_min_m, y_max_m = self.extent.bounds
         for device in self.devices:
-            self._check_in_extent(device)
+            if not (x_min_m <= device.x_m <= x_max_m and y_min_m <= device.y_m <= y_max_m):
+                raise ValueError(
+                    f"device {device.device!r} at ({device.x_m:g}, {device.y_m:g}) m lies outside "
+                    f"the extent (x {x_min_m:g} to {x_max_m:g} m, y {y_min_m:g} to {y_max_m:g} m); "
+                    "move it or widen the extent")
         altitudes_m = set(self.lattice.altitudes_m)
         for uav in self.uavs:
             if uav.altitude_m not in altitudes_m:
@@ -235,15 +240,6 @@ class SceneConfig(Table):
             for end in ("start", "terminal"):
                 self._check_on_lattice(uav, end)
         return self
-
-    def _check_in_extent(self, device: DeviceConfig) -> None:
-        """Raise ValueError if a device lies outside the extent."""
-        x_min_m, x_max_m, y_min_m, y_max_m = self.extent.bounds
-        if not (x_min_m <= device.x_m <= x_max_m and y_min_m <= device.y_m <= y_max_m):
-            raise ValueError(
-                f"device {device.device!r} at ({device.x_m:g}, {device.y_m:g}) m lies outside the "
-                f"extent (x {x_min_m:g} to {x_max_m:g} m, y {y_min_m:g} to {y_max_m:g} m); move it "
-                "or widen the extent")
 
     def _check_on_lattice(self, uav: UavConfig, end: str) -> None:
         """Raise ValueError if the start or terminal of a UAV is not on the lattice."""

@@ -76,7 +76,12 @@ def write_city(folder: Path | str, shapes: Sequence[CityShape]) -> None:
         root.append(_material_element(material))
     with progress("writing meshes", total=len(shapes)) as advance:
         for shape in shapes:
-            root.append(_shape_element(shape))
+            element = ET.SubElement(root, "shape", type="ply", id=f"mesh-{shape.name}")
+            ET.SubElement(element, "string", name="filename", value=f"meshes/{shape.name}.ply")
+            # Otherwise Mitsuba smooths the normals of walls that share vertices, and reflections
+            # go astray
+            ET.SubElement(element, "boolean", name="face_normals", value="true")
+            ET.SubElement(element, "ref", id=f"mat-{shape.material.name}", name="bsdf")
             write_ply(folder / "meshes" / f"{shape.name}.ply", shape.mesh.vertices,
                       shape.mesh.faces)
             advance(1)
@@ -108,16 +113,6 @@ def _add_float(element: ET.Element, name: str, value: float | None) -> None:
     """Add a `<float>` to an element, with all digits of its value."""
     assert value is not None  # a material outside the ITU table has both constants
     ET.SubElement(element, "float", name=name, value=repr(float(value)))
-
-
-def _shape_element(shape: CityShape) -> ET.Element:
-    """Return the `<shape>` element of a shape, which refers to its mesh file and material."""
-    element = ET.Element("shape", type="ply", id=f"mesh-{shape.name}")
-    ET.SubElement(element, "string", name="filename", value=f"meshes/{shape.name}.ply")
-    # Otherwise Mitsuba smooths the normals of walls that share vertices, and reflections go astray
-    ET.SubElement(element, "boolean", name="face_normals", value="true")
-    ET.SubElement(element, "ref", id=f"mat-{shape.material.name}", name="bsdf")
-    return element
 
 
 def read_triangles(xml_path: Path | str) -> list[tuple[RawMesh, Material | None, str]]:

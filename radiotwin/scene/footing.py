@@ -62,10 +62,7 @@ def moved_outdoors(city: CityMap, points_m: np.ndarray) -> np.ndarray:
 
 
 def _above_surface(city: CityMap, point_m: np.ndarray, to_ground: bool) -> Footing | None:
-    """Return the position just above the ground (else the roof) at a point (3,) [m], or None.
-
-    None if that surface is below the point, is no roof, or the position is indoors.
-    """
+    """Return the position just above the ground (else the roof); None if below, or indoors."""
     x_m, y_m, z_m = point_m.tolist()
     ground_m = float(city.ground_height_m(x_m, y_m))
     surface_m, sd_m, what = ground_m, GROUND_SD_M, "the ground"
@@ -80,10 +77,7 @@ def _above_surface(city: CityMap, point_m: np.ndarray, to_ground: bool) -> Footi
 
 
 def _roof_m(city: CityMap, x_m: float, y_m: float) -> tuple[float, float]:
-    """Return the height of the highest surface at x and y, and its standard deviation [m].
-
-    The height is -inf if there is no surface. An unknown deviation is `HEIGHT_SD_M`.
-    """
+    """Return the height of the highest surface (-inf: none) and its standard deviation [m]."""
     above_m = np.array([[x_m, y_m, city.vertices[:, 2].max() + 1.0]])
     distance_m, face, _ = city.first_hits_towards(above_m, DOWN)
     if face[0] < 0:

@@ -83,8 +83,19 @@ def load_shape(shape: DeclaredShape) -> RawMesh:
             shape, or coordinates that are not finite; with the mesh file, or the line of the XML
             file.
     """
+    path = shape.mesh_path
     if shape.kind in ("ply", "obj"):
-        raw = _read_mesh_file(shape)
+        if path is None:
+            raise BadInput(f"{shape.node.position}: the shape names no mesh file; add "
+                           '<string name="filename" value="meshes/NAME.ply"/>')
+        if not os.path.exists(path):
+            raise BadInput(f"mesh file {path} does not exist (named in {shape.node.position}); put "
+                           "it there or remove the shape")
+        if shape.kind == "ply":
+            raw = cut_polygons(path, *read_ply(path))
+        else:  # all objects are one mesh, as in Mitsuba
+            vertices, groups = read_obj_groups(path)
+            raw = cut_polygons(path, vertices, [one for found in groups.values() for one in found])
     elif shape.kind in ("cube", "rectangle", "sphere"):
         raw = _analytic(shape)
     else:
@@ -96,21 +107,6 @@ def load_shape(shape: DeclaredShape) -> RawMesh:
         mirrored = np.linalg.det(linear) < 0
     check_vertices(vertices, f"{shape.node.position}, after the transform")
     return RawMesh(vertices, raw.faces[:, ::-1] if mirrored else raw.faces, raw.polygons)
-
-
-def _read_mesh_file(shape: DeclaredShape) -> RawMesh:
-    """Read the PLY or OBJ file of a shape; all objects of an OBJ file become one mesh."""
-    path = shape.mesh_path
-    if path is None:
-        raise BadInput(f"{shape.node.position}: the shape names no mesh file; add "
-                       '<string name="filename" value="meshes/NAME.ply"/>')
-    if not os.path.exists(path):
-        raise BadInput(f"mesh file {path} does not exist (named in {shape.node.position}); put it "
-                       "there or remove the shape")
-    if shape.kind == "ply":
-        return cut_polygons(path, *read_ply(path))
-    vertices, groups = read_obj_groups(path)  # all objects are one mesh, as in Mitsuba
-    return cut_polygons(path, vertices, [one for polygons in groups.values() for one in polygons])
 
 
 def cut_polygons(path: Path, vertices: np.ndarray, polygons: list[np.ndarray]) -> RawMesh:

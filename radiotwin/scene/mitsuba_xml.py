@@ -156,10 +156,7 @@ def _check_city(root: Node) -> None:
 
 
 def _check_attributes(node: Node) -> None:
-    """Raise BadInput if an element of `city.xml` has an attribute, type or value not allowed.
-
-    Numbers must be finite, and no value may hold a `$`.
-    """
+    """Raise BadInput if an element of `city.xml` has an attribute, type or value not allowed."""
     for name, value in node.attributes.items():
         if name not in _ATTRIBUTES[node.tag]:
             raise BadInput(f"{node.position}: <{node.tag}> has {shown(name)}, which is not "
@@ -272,10 +269,7 @@ class _Reader:
         return top.children[0]
 
     def _read_children(self, parent: Node, files: tuple[Path, ...]) -> None:
-        """Read the materials, shapes, includes and parameters of a `<scene>` and its `merge`.
-
-        `files` are the file and those that include it.
-        """
+        """Read the children of a `<scene>` in `files`, the file and those that include it."""
         waiting = parent.children[::-1]
         while waiting:
             node = waiting.pop()

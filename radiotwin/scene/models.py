@@ -10,7 +10,6 @@ opened, except the buffers of a `.gltf` in its own folder.
 """
 
 import base64
-import binascii
 import io
 import struct
 from collections.abc import Iterator
@@ -131,7 +130,10 @@ class _Document:
                     raise ValueError(f"buffer {number} has no content")
                 buffers.append(binary)
             elif uri.startswith("data:"):
-                buffers.append(self._decoded(uri))
+                head, comma, content = uri.partition(",")
+                if not comma or not head.endswith(";base64"):
+                    raise ValueError("a buffer is not in base64")
+                buffers.append(base64.b64decode(content, validate=True))
             else:
                 name = unquote(uri)
                 if ":" in name or "\\" in name:
@@ -143,17 +145,6 @@ class _Document:
             size += len(buffers[-1])
             FILE_BYTES.check(size, f"{self.path} with its buffers")
         return buffers
-
-    @staticmethod
-    def _decoded(uri: str) -> bytes:
-        """Decode the base64 text of a `data:` URI."""
-        head, comma, content = uri.partition(",")
-        if not comma or not head.endswith(";base64"):
-            raise ValueError("a buffer is not in base64")
-        try:
-            return base64.b64decode(content, validate=True)
-        except binascii.Error as error:
-            raise ValueError(f"a buffer is not in base64: {error}") from None
 
     def parts(self) -> Iterator[ModelPart]:
         """Yield the triangles of each object of a glTF model, one mesh per material."""
@@ -208,10 +199,7 @@ class _Document:
         return str(self._entry(key, index).get("name") or f"{key}_{index}")[:200]
 
     def _faces(self, primitive: dict[str, Any], points: int) -> np.ndarray | None:
-        """Return the triangles (f, 3) of a glTF primitive; None if it has points or lines.
-
-        `points` is its number of vertices. Strips and fans are cut into triangles.
-        """
+        """Return the triangles (f, 3) of a primitive of some points; None if it has no areas."""
         mode = primitive.get("mode", _TRIANGLES)
         if mode not in (_TRIANGLES, _STRIP, _FAN):
             return None
@@ -234,10 +222,7 @@ class _Document:
         return strip
 
     def _accessor(self, index: Any, kind: str) -> np.ndarray:
-        """Return the (n, components) values of a glTF accessor, an array within a buffer.
-
-        `kind` is `SCALAR` (integers) or `VEC3` (reals); ValueError if it is another, or damaged.
-        """
+        """Return the (n, components) values of an accessor: `SCALAR` integers or `VEC3` reals."""
         accessor = self._entry("accessors", index)
         if accessor["type"] != kind or "sparse" in accessor or accessor.get("bufferView") is None:
             raise ValueError(f"accessor {index} is sparse, empty, or not of type {kind}")

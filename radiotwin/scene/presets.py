@@ -110,8 +110,7 @@ def _buildings_in(column: tuple[float, float], row: tuple[float, float], p: City
                   keep_free_m: np.ndarray, rng: np.random.Generator) -> list[tuple]:
     """Draw the buildings (x_min, y_min, x_max, y_max, height) [m] of one small block at random.
 
-    The block spans `column` in x and `row` in y. Buildings are cut back from the points
-    `keep_free_m` (k, 2) [m], and dropped if a side becomes too short.
+    It spans `column` in x and `row` in y. A building that becomes too narrow is dropped.
     """
     (x0, x1), (y0, y1) = column, row
     boxes = []

@@ -137,10 +137,7 @@ def _building_name(one: CityObject, by_name: Mapping[str, CityObject]) -> str:
 
 
 def _best_geometries(one: CityObject, lowest_lod: int) -> list[Geometry]:
-    """Return the geometries of the best level of detail: the highest below 3, else the lowest.
-
-    `lowest_lod` 1 considers surfaces in space (LoD 1 and more) only, 0 outlines only.
-    """
+    """Return surfaces (`lowest_lod` 1) or outlines (0) of the highest level below 3, or lowest."""
     usable = [geometry for geometry in one.geometries
               if any(len(ring) for polygon in geometry.polygons for ring in polygon)
               and (geometry.lod >= 1) == (lowest_lod >= 1)]

@@ -229,10 +229,7 @@ class _Reader:
             self.rings = None
 
     def _add_numbers(self, text: str, dimension: int) -> None:
-        """Append the coordinates in a text to those of the open ring, with z = 0 in two dimensions.
-
-        BadInput if the text is no list of positions of `dimension` (2 or 3) numbers.
-        """
+        """Append the coordinates in a text to the open ring, with z = 0 in two dimensions."""
         try:
             # `coordinates` of GML 2 has `x,y,z x,y,z`
             numbers = [float(word) for word in text.replace(",", " ").split()]
@@ -249,10 +246,7 @@ class _Reader:
             VERTICES.check(len(self.numbers) / 3, self.path)
 
     def _end_of_value(self, name: str, value: str) -> None:
-        """Store a text as an attribute of the open object, with ` ft` if its unit is the foot.
-
-        The text is of an element directly in the object, or of a generic attribute.
-        """
+        """Store a text as an attribute of the open object, with ` ft` if its unit is the foot."""
         known = self.open[-1][1].attributes
         if not value:
             return

@@ -109,12 +109,9 @@ def _attributes(known: Any) -> dict[str, str]:
 
 
 def _geometries(geometry: Mapping, corners: np.ndarray) -> Iterator[Geometry]:
-    """Yield a CityJSON geometry's parts: each solid's outer shell, or its surfaces together.
-
-    Other types, such as points, are skipped.
-    """
+    """Yield a CityJSON geometry's parts: each solid's outer shell, or its surfaces together."""
     kind = geometry["type"]
-    if kind not in _DEPTHS:
+    if kind not in _DEPTHS:  # such as points
         return
     boundaries = geometry["boundaries"]
     lod = float(geometry.get("lod", 2))

@@ -238,14 +238,11 @@ class OutlineBudget:
         OUTLINE_CORNERS.check(corners, subject)
         self.corners += corners
         VERTICES.check(self.corners, self.source)
-        if not area.is_valid:
-            self.crossings += self._count_crossings(subject, area)
-
-    def _count_crossings(self, subject: str, area: BaseGeometry) -> int:
-        """Return how often an area's sides cross; BadInput if with those before it is too often."""
+        if area.is_valid:
+            return
         rings = shapely.get_rings(shapely.get_parts(shapely.get_parts(area)))
         points = [shapely.get_coordinates(ring) for ring in rings]
         ends = [np.stack([ring[:-1], ring[1:]], axis=1) for ring in points]
         segments: Any = shapely.linestrings(np.concatenate([np.zeros((0, 2, 2)), *ends]))
-        return count_meetings(segments, _CHUNK,
-                              lambda count: CROSSINGS.check(self.crossings + count, subject))
+        self.crossings += count_meetings(
+            segments, _CHUNK, lambda count: CROSSINGS.check(self.crossings + count, subject))

@@ -325,10 +325,7 @@ def read_geopackage(path: Path, crs: str | None = None, wanted: Sequence[str] = 
 
 
 def _layers(database: sqlite3.Connection, others: list[str]) -> list[tuple[str, str, int]]:
-    """Return table, geometry column and srs_id of each layer of areas in a GeoPackage.
-
-    Names of its other layers of geometries are appended to `others`.
-    """
+    """Return table, geometry column and srs_id of each layer of areas; `others` gets the others."""
     for table in ("gpkg_contents", "gpkg_geometry_columns", "gpkg_spatial_ref_sys"):
         require_table(database, table)
     registered = {str(name).lower() for name, kind in scan(

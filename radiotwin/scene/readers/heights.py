@@ -78,22 +78,17 @@ class HeightColumn:
         return STOREYS_SD_M if self.unit == STOREYS or self.name == ESTIMATED else TAG_SD_M
 
 
-def _elevations(ground: str, *names: str) -> tuple[HeightColumn, ...]:
-    """Return columns of roof elevations that share a column of the ground's elevation."""
-    return tuple(HeightColumn(name, ground=ground) for name in names)
-
-
 KNOWN = (
     *(HeightColumn(name) for name in (
         "height", "building:height", "measuredheight", "gesamthoehe", "gebaeudehoehe", "hoehe",
         "height_m", "hauteur", "relhmax", "relh2")),
     HeightColumn(ESTIMATED),
     *(HeightColumn(name, "ft") for name in ("heightroof", "height_roof", "height_ft")),
-    *_elevations("b3_h_maaiveld", "b3_h_dak_max", "b3_h_max", "b3_h_dak_70p",
-                 "b3_h_70p", "b3_h_dak_50p", "b3_h_50p"),
-    *_elevations("h_maaiveld", "h_dak_max"),
-    *_elevations("gelaendepunkt", "dach_max"),
-    *_elevations("hoehegrund", "hoehedach"),
+    *(HeightColumn(name, ground="b3_h_maaiveld") for name in (
+        "b3_h_dak_max", "b3_h_max", "b3_h_dak_70p", "b3_h_70p", "b3_h_dak_50p", "b3_h_50p")),
+    HeightColumn("h_dak_max", ground="h_maaiveld"),
+    HeightColumn("dach_max", ground="gelaendepunkt"),
+    HeightColumn("hoehedach", ground="hoehegrund"),
     *(HeightColumn(name, STOREYS) for name in (
         "building:levels", "num_floors", "storeysaboveground", "b3_bouwlagen", "numfloors",
         "nombre_d_etages", "nb_etages", "numberoffloorsaboveground", "aog", "geschosse",
@@ -260,10 +255,9 @@ def height_of(tags: Mapping[str, str], default_m: float,
 
 def _first_length_m(tags: Mapping[str, str], keys: Iterable[tuple[str, float]], unusable: list[str],
                     lowest_m: float = 0.0) -> float:
-    """Return the first tag's value that is a possible length [m]; 0 if there is none.
+    """Return the first possible length of the tags `keys` (with units [m]) [m]; 0 if none has one.
 
-    `keys` are tags with their units [m], possible values from `lowest_m` to `MAX_HEIGHT_M`. Tags
-    with other values are appended to `unusable`.
+    Tags with other values are appended to `unusable`.
     """
     for key, unit_m in keys:
         if key in tags:

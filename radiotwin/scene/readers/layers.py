@@ -64,11 +64,7 @@ def choose_layers(path: Path, columns: Mapping[str, Sequence[str]],
 
 
 def _building_layers(columns: Mapping[str, Sequence[str]]) -> list[str]:
-    """Return the layers that hold buildings, by their names and columns.
-
-    Of 3D BAG's they are the outlines and the most detailed LoD in 2D. Else, those with tags of
-    buildings; if there are none, with names like `building`; then, with known heights.
-    """
+    """Return the layers that hold buildings, by their names and columns."""
     names = list(columns)
     if len(names) < 2:
         return names

@@ -108,10 +108,7 @@ def _remedy(source: str, known: Sequence[tuple[str, Height, BaseGeometry]],
 
 def _ground_column(known: Sequence[tuple[str, Height, BaseGeometry]],
                    columns: Mapping[str, Mapping[str, str]]) -> str | None:
-    """Return the column that may hold the ground's elevation; None if there is none.
-
-    It is one that, subtracted from implausible heights, leaves usual ones for every building.
-    """
+    """Return a column that, subtracted from implausible heights, leaves usual ones, or None."""
     rows = [(height.top_m, columns.get(name, {})) for name, height, _ in known]
     for column in sorted({column for _, tags in rows for column in tags}):
         above_m = np.array([top_m - number(tags.get(column, "")) for top_m, tags in rows])

@@ -268,10 +268,7 @@ def _resolve_parts(
 
 
 def _inherit_tags(part: Feature, building: Feature) -> Feature:
-    """Return a building part with the tags of its building added where it has none.
-
-    Not inherited are the bottom, and tags that would change the part's own height.
-    """
+    """Return a part with its building's tags, without its bottom and those of another height."""
     tags = {key: value for key, value in building.tags.items()
             if key not in ("min_height", "building:min_level")}
     known = [column.name for column in KNOWN]

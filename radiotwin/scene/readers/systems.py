@@ -109,9 +109,7 @@ def find_city_system(path: Path, name: str) -> "CRS":
 def vertical_unit_m(system: "CRS") -> float:
     """Return how many metres the unit of a system's elevations has; without one, of its plane."""
     axes = system.axis_info
-    if len(axes) > 2:
-        return float(axes[2].unit_conversion_factor)
-    return plane_unit_m(system)
+    return float(axes[2].unit_conversion_factor) if len(axes) > 2 else plane_unit_m(system)
 
 
 def plane_unit_m(system: "CRS") -> float:
@@ -152,5 +150,4 @@ def to_degrees(path: Path, system: "CRS", points: np.ndarray) -> np.ndarray:
 
 def plane_of(system: "CRS") -> "CRS":
     """Return the horizontal part of a system."""
-    parts = system.sub_crs_list
-    return parts[0] if parts else system.to_2d()
+    return system.sub_crs_list[0] if system.sub_crs_list else system.to_2d()

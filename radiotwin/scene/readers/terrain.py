@@ -206,7 +206,13 @@ def read_heights(path: Path, origin: Origin, box_m: Bounds, unit: str | None = N
     covered = (known[tuple(nearest)] & (np.abs(at[0] - nearest[0]) <= 0.51)
                & (np.abs(at[1] - nearest[1]) <= 0.51))
     if not covered.mean() >= MIN_KNOWN:
-        raise _uncovered(path, origin, box_m, float(covered.mean()))
+        x_min, x_max, y_min, y_max = box_m
+        west, south = (float(value) for value in to_geographic(origin, x_min, y_min))
+        east, north = (float(value) for value in to_geographic(origin, x_max, y_max))
+        raise BadInput(f"{path} has heights for {covered.mean():.0%} of the scene, "
+                       f"{MIN_KNOWN:.0%} are needed; give a raster that covers {south:.5f},"
+                       f"{west:.5f},{north:.5f},{east:.5f} (south,west,north,east), or choose a "
+                       "part with --bbox")
     if not known.all():
         height = height[tuple(distance_transform_edt(~known, return_distances=False,
                                                      return_indices=True))]
@@ -296,10 +302,7 @@ def _pixels_of(file: Any, system: "CRS", origin: Origin) -> Any:
 
 def _vertical(path: Path, file: Any, system: "CRS",
               declared: str | None) -> tuple[float, str, Vertical]:
-    """Return the factor of heights to metres, the name of their vertical reference, and its kind.
-
-    `declared` is the unit that the user gave: `m`, `ft`, or None.
-    """
+    """Return the factor of heights to metres, and the name and kind of their vertical reference."""
     vertical = next((part for part in system.sub_crs_list if part.is_vertical), None)
     axis = vertical.axis_info[0] if vertical is not None else (
         system.axis_info[2] if len(system.axis_info) == 3 else None)
@@ -403,16 +406,6 @@ def _means(values: np.ndarray, every: int) -> np.ndarray:
     count = known.sum(axis=(1, 3))
     total = np.where(known, squares, 0.0).sum(axis=(1, 3))
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
-
-
-def _uncovered(path: Path, origin: Origin, box_m: Bounds, share: float) -> BadInput:
-    """Return the error that a raster covers only a share (0 to 1) of the box [m]."""
-    x_min, x_max, y_min, y_max = box_m
-    west, south = (float(value) for value in to_geographic(origin, x_min, y_min))
-    east, north = (float(value) for value in to_geographic(origin, x_max, y_max))
-    return BadInput(f"{path} has heights for {share:.0%} of the scene, {MIN_KNOWN:.0%} are needed; "
-                    f"give a raster that covers {south:.5f},{west:.5f},{north:.5f},{east:.5f} "
-                    "(south,west,north,east), or choose a part with --bbox")
 
 
 @dataclass(frozen=True, eq=False)
