@@ -74,15 +74,6 @@ def test_a_device_can_be_appended_by_hand(tmp_path, devices):
     assert again.devices[-1].device == "mine" and again.devices[-1].x_m == 5
 
 
-def test_the_greatest_lattice_is_allowed(tmp_path, monkeypatch):
-    monkeypatch.setenv("RADIOTWIN_MAX_POSITIONS", "10_000_000")
-    text = GOOD.split("[[devices]]")[0].replace("x_max_m = 100", "x_max_m = 9999")
-    text = text.replace("y_max_m = 60", "y_max_m = 999")
-    assert read_config(write(tmp_path, text.replace("step_m = 20", "step_m = 1"))).lattice.step_m == 1
-    with pytest.raises(BadInput, match="positions; at most 10,000,000"):
-        read_config(write(tmp_path, text.replace("step_m = 20", "step_m = 1").replace("999\n", "1000\n")))
-
-
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(("old", "new", "message"), [
     ("frequency_hz = 3.5e9", "frequency_hz = -1", r"radio\.frequency_hz = -1: allowed is 1e6 Hz to 450e9 Hz .*GHz"),

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from radiotwin.errors import BadInput
-from radiotwin.scene.meshes import clean, is_volume, load_shape, load_shapes, read_obj_groups
+from radiotwin.scene.meshes import clean, load_shape, load_shapes, read_obj_groups
 from radiotwin.scene.mitsuba_xml import read_mitsuba_xml
 
 TRANSFORM = '<shape type="{}" id="a"><transform name="to_world">{}</transform></shape>'
@@ -120,12 +120,3 @@ def test_one_mesh_named_many_times_has_one_budget(empty_city, monkeypatch):
     monkeypatch.setenv("RADIOTWIN_MAX_SHAPES", "3")
     with pytest.raises(BadInput, match="4 shapes; at most 3"):
         read_mitsuba_xml(empty_city.path)
-
-
-def test_what_encloses_a_volume(town):
-    vertices, faces = town.box((0, 9), (0, 5))
-    faces = np.array(faces)
-    assert is_volume(vertices + [1e5, 1e5, 0], faces)
-    turned = np.concatenate([faces[:1, ::-1], faces[1:]])
-    for other in (faces[:, ::-1], faces[1:], turned, np.concatenate([faces, faces]), faces[:0]):
-        assert not is_volume(vertices, other)

@@ -21,13 +21,6 @@ def town():
     return CityMap(mesh.vertices, mesh.faces, (Material("concrete", "concrete"), Material("brick", "brick")), material)
 
 
-def test_houses_are_told_apart_and_the_ground_is_none(town):
-    building = building_of_vertex(town)
-    assert set(building[-4:]) == {-1}
-    assert len(np.unique(building[:-4])) == SIDE**2
-    assert (building[:-4].reshape(SIDE**2, -1) == building[:-4:8, None]).all()
-
-
 def test_houses_that_share_a_wall_are_one():
     boxes = [trimesh.creation.box(bounds=[[20 * i, 0, 0], [20 * i + 20, 30, 15]]) for i in range(3)]
     mesh = trimesh.util.concatenate(boxes)

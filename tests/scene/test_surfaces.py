@@ -40,38 +40,11 @@ def test_neighbours_of_opposite_sense():
     assert Surfaces([box(), (corners, faces)]).inconsistent_shapes().tolist() == [1]
 
 
-def test_free_edges_of_an_open_bottom():
-    edges, owner = Surfaces([box(), box(x=(20, 30), sides=("top", *WALLS))]).free_edges
-    assert len(edges) == 4 and (owner >= 12).all()
-
-
-def test_roof_apart_from_walls_is_a_seam():
-    shapes = [box(sides=WALLS), box(sides=("top",)), box(x=(50, 60))]
-    used = [(corners[np.unique(faces)], np.searchsorted(np.unique(faces), faces)) for corners, faces in shapes]
-    assert Surfaces(used).seams().tolist() == [[0, 1]]
-
-
-def test_plane_under_boxes_is_ground_and_roofs_are_not():
-    surfaces = Surfaces([box(z=(0, 15)), PLANE, box(x=(30, 50), sides=("top",)), box(x=(30, 50), sides=WALLS)])
-    np.testing.assert_array_equal(surfaces.ground_faces(), surfaces.shape == 1)
-
-
 def test_streets_on_flat_ground_are_ground():
     street = PLANE[0] * [0.05, 1, 1] + [0, 0, 0.1], PLANE[1]
     surfaces = Surfaces([PLANE, street, box(z=(0, 15))])
     np.testing.assert_array_equal(surfaces.ground_faces(), surfaces.shape < 2)
     assert not Surfaces([box(), box(x=(12, 22)), box(y=(12, 22))]).ground_faces().any()
-
-
-def test_terrain_is_ground():
-    x, y = np.meshgrid(np.linspace(-100, 100, 21), np.linspace(-100, 100, 21))
-    vertices = np.column_stack([x.ravel(), y.ravel(), 8 * np.sin(x.ravel() / 40) + 8])
-    start = (np.arange(20)[:, None] * 21 + np.arange(20)).ravel()
-    faces = np.concatenate(
-        [np.column_stack([start, start + 1, start + 22]), np.column_stack([start, start + 22, start + 21])]
-    )
-    surfaces = Surfaces([(vertices, faces), box(z=(5, 40)), box(x=(50, 60), z=(5, 30))])
-    np.testing.assert_array_equal(surfaces.ground_faces(), surfaces.shape == 0)
 
 
 def test_ground_within_one_mesh_with_the_buildings():

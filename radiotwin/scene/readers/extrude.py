@@ -46,8 +46,6 @@ def make_blocks(prisms: Sequence[Prism], contacts: Contacts) -> list[Block]:
 
     Where blocks of different materials overlap or touch, the smaller one is cut back.
     """
-    if not prisms:
-        return []
     is_open = np.array([prism.model_surfaces is not None and prism.model_surfaces.solid is None
                         for prism in prisms])
     pairs = contacts.pairs[contacts.shared_m > GRID_M]

@@ -483,7 +483,7 @@ def _fact(grid: HeightGrid, mesh: GroundMesh, datum_m: float) -> str:
 
 
 def raise_to_terrain(prisms: Sequence[Prism], ground: Ground) -> list[Prism]:
-    """Return the buildings moved up to a terrain; on flat ground, unchanged.
+    """Return the buildings moved up to a terrain.
 
     Heights of OpenStreetMap, and of most 3D city models, count from the lowest point where the
     building meets the ground [1], those of its parts, too. Walls that begin at the ground are
@@ -491,8 +491,6 @@ def raise_to_terrain(prisms: Sequence[Prism], ground: Ground) -> list[Prism]:
 
     [1] https://wiki.openstreetmap.org/wiki/Key:height
     """
-    if ground.config is None:
-        return list(prisms)
     # Parts of a building share its footprint: the ground is looked up once for all
     footprints = {id(footprint): footprint for footprint in (
         prism.building_footprint or prism.area for prism in prisms)}

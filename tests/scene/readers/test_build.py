@@ -100,18 +100,6 @@ def test_a_box_of_degrees(tmp_path):
     assert x_max - x_min < x_m[1] - x_m[0] + 40 and report.extent_m == scene.config.extent.bounds
 
 
-@pytest.mark.seconds
-def test_only_a_scene_is_replaced(tmp_path, empty_map):
-    path = empty_map.box(0, 0, 20, 20, height="5").write(tmp_path / "a.osm")
-    for _ in range(2):
-        build_scene_from_map(path, tmp_path / "out")
-    (tmp_path / "out" / "notes.txt").write_text("mine")
-    with pytest.raises(BadInput, match="holds notes.txt"):
-        build_scene_from_map(path, tmp_path / "out")
-    with pytest.raises(BadInput, match="choose another output folder"):
-        build_scene_from_map(path, tmp_path)
-
-
 def test_the_table_of_materials_is_used(tmp_path):
     options = BuildOptions(materials={"straw": "itu_wood", "ground": "wet_ground"})
     report = build_scene_from_map(TOWN, tmp_path / "unused", options, check_only=True)

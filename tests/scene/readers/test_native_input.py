@@ -13,7 +13,6 @@ import pytest
 import shapely
 
 from radiotwin.errors import BadInput
-from radiotwin.scene.meshes import cut_polygon, is_closed
 from radiotwin.scene.readers import build_scene
 from radiotwin.scene.readers.gis_files import area_of_wkb
 from tests.scene.readers import city_models as made
@@ -125,27 +124,6 @@ def test_a_face_that_crosses_itself_everywhere(tmp_path):
     (tmp_path / "a.obj").write_text("\n".join(lines))
     with pytest.raises(BadInput, match="a face of 1,000 corners: .* crossings of outlines with themselves; at most 2,000"):
         build_scene(tmp_path / "a.obj", tmp_path / "out", check_only=True)
-
-
-@pytest.mark.parametrize("count", [3, 4, 7, 40])
-def test_a_cut_polygon_has_all_its_corners(count):
-    """Corners on its edges, and a hole in either direction: all edges of all rings are edges of its triangles."""
-    rng = np.random.default_rng(count)
-    side = np.sort(rng.uniform(0, 10, count))
-    outline = np.concatenate([[(x, 0) for x in side], [(10, y) for y in side], [(10 - x, 10) for x in side],
-                              [(0, 10 - y) for y in side]])
-    hole = np.array([(4, 4), (5, 4), (6, 4), (6, 6), (4, 6)])
-    for inner in (hole, hole[::-1]):
-        corners = np.column_stack([np.concatenate([outline, inner]), np.zeros(len(outline) + 5)])
-        ends = [len(outline), len(corners)]
-        triangles = cut_polygon(corners, ends)
-        assert set(triangles.ravel().tolist()) == set(range(len(corners)))
-        cap = np.concatenate([triangles[:, ::-1], triangles + len(corners)])  # with walls a closed body
-        walls = [(a, b, b + len(corners), a + len(corners)) for first, last, turned in (
-            (0, ends[0], False), (ends[0], ends[1], np.array_equal(inner, hole)))
-            for a, b in [(i, i + 1 if i + 1 < last else first)[::-1 if turned else 1] for i in range(first, last)]]
-        body = np.concatenate([cap, [(a, b, c) for a, b, c, _ in walls], [(a, c, d) for a, _, c, d in walls]])
-        assert is_closed(body) and not is_closed(body[1:])
 
 
 def wkb(kind, *parts, order="<"):
