@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -27,28 +28,18 @@ class Problem:
     Attributes:
         severity: `error`: tracing would fail; `warning`: tracing works, but the result may not be
             the intended one; `fixed`: corrected in the scene that is written.
-        shape: Name of the shape or material concerned, or "" for the whole city.
         message: The problem, and what to do or what was done about it.
+        shape: Name of the shape or material concerned, or "" for the whole city.
     """
 
     severity: Severity
-    shape: str
     message: str
+    shape: str = ""
 
 
-def error(message: str, shape: str = "") -> Problem:
-    """Return a problem that makes tracing fail."""
-    return Problem("error", shape, message)
-
-
-def warning(message: str, shape: str = "") -> Problem:
-    """Return a problem that leaves the scene traceable."""
-    return Problem("warning", shape, message)
-
-
-def fixed(message: str, shape: str = "") -> Problem:
-    """Return a problem that was corrected."""
-    return Problem("fixed", shape, message)
+error = partial(Problem, "error")
+warning = partial(Problem, "warning")
+fixed = partial(Problem, "fixed")
 
 
 def listed(names: Sequence[str]) -> str:

@@ -33,7 +33,7 @@ from radiotwin.scene.materials import (
     map_materials,
     safe_name,
 )
-from radiotwin.scene.meshes import RawMesh, load_shapes
+from radiotwin.scene.meshes import MeshBudget, RawMesh, load_shape
 from radiotwin.scene.mitsuba_xml import DeclaredCity, read_mitsuba_xml
 from radiotwin.scene.models import UP_AXES
 from radiotwin.scene.ply import write_ply
@@ -174,8 +174,10 @@ def _parse_city_xml(xml_path: Path) -> DeclaredCity:
 
 def _load_meshes(xml_path: Path, declared: DeclaredCity) -> list[RawMesh]:
     """Load the meshes of a city, and check that they are triangles near the origin."""
-    meshes = []
-    for shape, mesh in zip(declared.shapes, load_shapes(declared.shapes, xml_path)):
+    meshes, budget = [], MeshBudget(xml_path)
+    for shape in declared.shapes:
+        mesh = load_shape(shape)
+        budget.add(mesh)
         farthest_m = float(np.abs(mesh.vertices).max(initial=0.0))
         if farthest_m > MAX_COORDINATE_M:
             raise BadInput(f"{shape.node.position}: the shape reaches {farthest_m:g} m from the "

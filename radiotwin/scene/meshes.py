@@ -3,7 +3,7 @@
 import io
 import os
 from array import array
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,19 +42,6 @@ class RawMesh:
     vertices: np.ndarray
     faces: np.ndarray
     polygons: int = 0
-
-
-def load_shapes(shapes: Iterable[DeclaredShape], source: Path) -> Iterator[RawMesh]:
-    """Load the shapes of the XML file `source` one by one, within limits for all together.
-
-    Raises:
-        BadInput: As `load_shape`, or all shapes together have too many vertices or faces.
-    """
-    budget = MeshBudget(source)
-    for shape in shapes:
-        mesh = load_shape(shape)
-        budget.add(mesh)
-        yield mesh
 
 
 class MeshBudget:

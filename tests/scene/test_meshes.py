@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from radiotwin.errors import BadInput
-from radiotwin.scene.meshes import clean, load_shape, load_shapes, read_obj_groups
+from radiotwin.scene.importer import import_city
+from radiotwin.scene.meshes import clean, load_shape, read_obj_groups
 from radiotwin.scene.mitsuba_xml import read_mitsuba_xml
 
 TRANSFORM = '<shape type="{}" id="a"><transform name="to_world">{}</transform></shape>'
@@ -112,11 +113,10 @@ def test_a_bad_obj_file_names_the_row(tmp_path, text, row):
 def test_one_mesh_named_many_times_has_one_budget(empty_city, monkeypatch):
     for number in range(4):
         empty_city.add(f"a{number}", ([(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)]))
-    shapes = read_mitsuba_xml(empty_city.write()).shapes
-    assert len(list(load_shapes(shapes, empty_city.path))) == 4
+    import_city(empty_city.write(), {})
     monkeypatch.setenv("RADIOTWIN_MAX_VERTICES", "10")
     with pytest.raises(BadInput, match="town.xml with its meshes: 12 vertices; at most 10"):
-        list(load_shapes(shapes, empty_city.path))
+        import_city(empty_city.path, {})
     monkeypatch.setenv("RADIOTWIN_MAX_SHAPES", "3")
     with pytest.raises(BadInput, match="4 shapes; at most 3"):
         read_mitsuba_xml(empty_city.path)

@@ -46,8 +46,7 @@ def make_blocks(prisms: Sequence[Prism], contacts: Contacts) -> list[Block]:
 
     Where blocks of different materials overlap or touch, the smaller one is cut back.
     """
-    is_open = np.array([prism.model_surfaces is not None and prism.model_surfaces.solid is None
-                        for prism in prisms])
+    is_open = np.array([isinstance(prism.model_surfaces, tuple) for prism in prisms])
     pairs = contacts.pairs[contacts.shared_m > GRID_M]
     pairs = pairs[~is_open[pairs].any(axis=1)]
     same = np.array([prisms[a].material == prisms[b].material for a, b in pairs], dtype=bool)
@@ -66,8 +65,8 @@ def make_blocks(prisms: Sequence[Prism], contacts: Contacts) -> list[Block]:
             members = sorted(part.tolist(), key=lambda i: -volume_m3[i])
             advance(1)
             surfaces = prisms[members[0]].model_surfaces
-            if surfaces is not None and surfaces.mesh is not None:
-                vertices, faces = surfaces.mesh
+            if isinstance(surfaces, tuple):
+                vertices, faces = surfaces
                 rise_m = prisms[members[0]].height.top_m - vertices[:, 2].max()
                 mesh = trimesh.Trimesh(vertices + [0, 0, rise_m], faces, process=False)
                 blocks.append(Block(members, prisms[members[0]].material, mesh))
@@ -117,10 +116,10 @@ def _placed_model(prism: Prism) -> Manifold:
 
     On terrain the prism's bottom is lower than the moved solid's: vertical walls fill the gap.
     """
-    assert prism.model_surfaces is not None and prism.model_surfaces.solid is not None
-    _, _, low_m, _, _, high_m = prism.model_surfaces.solid.bounding_box()
+    assert isinstance(prism.model_surfaces, Manifold)
+    _, _, low_m, _, _, high_m = prism.model_surfaces.bounding_box()
     rise_m, height = prism.height.top_m - high_m, prism.height
-    solid = prism.model_surfaces.solid.translate((0, 0, rise_m))
+    solid = prism.model_surfaces.translate((0, 0, rise_m))
     if low_m + rise_m - height.bottom_m <= GRID_M:
         return solid
     return _union([solid, *(_extruded(polygon, height.bottom_m, low_m + rise_m)

@@ -125,7 +125,7 @@ class MapFile:
 
 def problems_of(names: Sequence[str], text: str, severity: Severity = "warning") -> list[Problem]:
     """Return one problem: the number of names, a text, and the first names; [] without names."""
-    return [Problem(severity, "", f"{len(names)} {text} ({listed(names)})")] if names else []
+    return [Problem(severity, f"{len(names)} {text} ({listed(names)})")] if names else []
 
 
 def left_out_problems(left_out: Sequence[LeftOut],

@@ -43,17 +43,8 @@ _WALL_SINE = 0.02  # a triangle with a smaller share of its area seen from above
 _DECIMALS = 4  # of corners [m]: equal ones are welded, as by `meshes.WELD_M`
 
 
-@dataclass(frozen=True, eq=False)
-class ModelSurfaces:
-    """Surfaces of a building from a 3D model, in the local frame [m].
-
-    Attributes:
-        solid: the solid if the surfaces are closed, else None.
-        mesh: (v, 3) corners and (f, 3) faces if they are open, else None.
-    """
-
-    solid: Manifold | None
-    mesh: tuple[np.ndarray, np.ndarray] | None
+ModelSurfaces = Manifold | tuple[np.ndarray, np.ndarray]
+"""Surfaces of a 3D model, in the local frame [m]: closed, or open: corners (v, 3), faces (f, 3)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -368,8 +359,8 @@ def make_shell_prisms(features: Sequence[Feature], origin: Origin, table: Materi
         if not 0 < top_m <= MAX_HEIGHT_M:
             defects.add("too tall", f"{feature.name}: {top_m:.4g} m")
             continue
-        model_surfaces, closed = _model_surfaces(vertices, faces)
-        if not closed:
+        model_surfaces = _model_surfaces(vertices, faces)
+        if isinstance(model_surfaces, tuple):
             defects.add("open", feature.name)
         if value := table.unknown(feature.tags):
             defects.add("material", f"{feature.name}: {value}")
@@ -433,8 +424,8 @@ def _footprint(vertices: np.ndarray, faces: np.ndarray, name: str) -> shapely.Mu
     return _polygons(shapely.union_all(shapely.set_precision(flat, GRID_M)))
 
 
-def _model_surfaces(vertices: np.ndarray, faces: np.ndarray) -> tuple[ModelSurfaces, bool]:
-    """Return a building's triangles as a solid if closed, else as a mesh; and whether closed."""
+def _model_surfaces(vertices: np.ndarray, faces: np.ndarray) -> ModelSurfaces:
+    """Return a building's triangles as a solid if they are closed, else as a mesh."""
     used, faces = np.unique(faces, return_inverse=True)
     vertices, faces = vertices[used], faces.reshape(-1, 3)
     solid = closed_solid(vertices, faces)
@@ -444,10 +435,10 @@ def _model_surfaces(vertices: np.ndarray, faces: np.ndarray) -> tuple[ModelSurfa
         faces = np.asarray(mesh.faces)
         solid = closed_solid(vertices, faces)
     if solid is not None:
-        return ModelSurfaces(solid, None), True
+        return solid
     cleaned = clean(vertices, faces)[:2]
     surfaces = Surfaces([cleaned])
-    return ModelSurfaces(None, (cleaned[0], surfaces.turned(surfaces.inward()).faces)), False
+    return cleaned[0], surfaces.turned(surfaces.inward()).faces
 
 
 def closed_solid(vertices: np.ndarray, faces: np.ndarray) -> Manifold | None:

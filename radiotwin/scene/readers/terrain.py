@@ -501,9 +501,8 @@ def raise_to_terrain(prisms: Sequence[Prism], ground: Ground) -> list[Prism]:
         bottom_m = low_m + height.bottom_m if height.bottom_m > 0 else low_m - SKIRT_M
         surfaces = prism.model_surfaces
         # Closed ones are moved by their height later.
-        if surfaces is not None and surfaces.mesh is not None:
-            corners_m, faces = surfaces.mesh
-            surfaces = replace(surfaces, mesh=(corners_m + [0.0, 0.0, low_m], faces))
+        if isinstance(surfaces, tuple):
+            surfaces = surfaces[0] + [0.0, 0.0, low_m], surfaces[1]
         stood.append(replace(prism, ground_m=low_m, model_surfaces=surfaces, height=replace(
             height, bottom_m=bottom_m, top_m=low_m + height.top_m)))
     return stood
