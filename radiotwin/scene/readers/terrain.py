@@ -188,12 +188,18 @@ def read_heights(path: Path, origin: Origin, box_m: Bounds, unit: str | None = N
             system, with several bands, of impossible numbers, or too large; or it does not cover
             the area.
     """
+    from pyproj import Transformer
+
     with _opened(path) as file:
         system = _system(path, file)
-        to_pixel = _pixels_of(file, system, origin)
         factor, reference, kind = _vertical(path, file, system, unit)
         x_m, y_m, every, pixel_m = _nodes(file, system, origin, box_m)
-        column, row = to_pixel(*np.meshgrid(x_m, y_m))
+        to_system = Transformer.from_crs("EPSG:4326", system.to_2d(), always_xy=True)
+        east, north = map(np.asarray, to_system.transform(
+            *to_geographic(origin, *np.meshgrid(x_m, y_m))))
+        inverse = ~file.transform
+        column = inverse.a * east + inverse.b * north + inverse.c
+        row = inverse.d * east + inverse.e * north + inverse.f
         height, first, voids = _window(path, file, column, row, every, pixel_m / factor)
     height = height * factor
     wrong = (height < HEIGHTS_M[0]) | (height > HEIGHTS_M[1])
@@ -282,22 +288,6 @@ def _system(path: Path, file: Any) -> "CRS":
     if not abs(file.transform.determinant) > 0:
         raise BadInput(f"{path} has pixels without an area; export it again")
     return find_system(path, file.crs.to_wkt(version="WKT2_2019"))
-
-
-def _pixels_of(file: Any, system: "CRS", origin: Origin) -> Any:
-    """Return a function from x, y in the local frame [m] to column and row of the raster."""
-    from pyproj import Transformer
-
-    transformer = Transformer.from_crs("EPSG:4326", system.to_2d(), always_xy=True)
-    inverse = ~file.transform
-
-    def to_pixel(x_m: np.ndarray, y_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        east, north = transformer.transform(*to_geographic(origin, x_m, y_m))
-        east, north = np.asarray(east), np.asarray(north)
-        return (inverse.a * east + inverse.b * north + inverse.c,
-                inverse.d * east + inverse.e * north + inverse.f)
-
-    return to_pixel
 
 
 def _vertical(path: Path, file: Any, system: "CRS",
