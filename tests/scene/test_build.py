@@ -249,12 +249,6 @@ def test_report_is_printed(town):
     assert "error" in text and "[red]stone" in text
 
 
-def test_street_canyon_of_sionna(tmp_path):
-    report = build_scene("sionna:simple_street_canyon", tmp_path / "out")
-    assert report.shapes == 7 and report.tallest_m == pytest.approx(50.97, abs=0.01)
-    assert {use.name for use in report.materials} == {"glass", "marble", "wood", "brick", "concrete"}
-
-
 @pytest.mark.seconds
 def test_munich_of_sionna(tmp_path):
     """Rationale: a real city of 2367 meshes, roofs apart from open-bottomed walls.

@@ -78,15 +78,6 @@ def test_a_house_lies_where_the_model_says(tmp_path):
     assert scene.city.height_at(x_m, y_m) == pytest.approx([9.0, 7.5], abs=0.01)
 
 
-def test_an_outline_is_extruded_to_its_attribute(tmp_path):
-    model = made.cityjson([(0, 0, 3)], b3_h_dak_max=11.5, b3_h_maaiveld=3.0)
-    del model["CityObjects"]["B0-0"]
-    report = build_scene_from_map(write(tmp_path, model), tmp_path / "out")
-    assert dict(report.facts)["heights from"] == "b3_h_dak_max - b3_h_maaiveld: 1, default: 0 (10 m)"
-    (mesh,) = solids(report).values()
-    assert mesh.volume == pytest.approx(120 * 8.5, rel=2e-3)
-
-
 @pytest.mark.seconds
 def test_an_outline_of_citygml(tmp_path):
     points = made.corners(691_000, 5_336_000, 500)[:4]
