@@ -264,7 +264,10 @@ class _Reader:
             open_nodes[-1].children.append(node)
             open_nodes.append(node)
 
-        self.bytes += parse_elements(path, start, lambda tag: open_nodes.pop(), DOCUMENT_BYTES)
+        def end(tag: str) -> None:
+            open_nodes.pop()
+
+        self.bytes += parse_elements(path, start, end, DOCUMENT_BYTES)
         DOCUMENT_BYTES.check(self.bytes, f"{self.path} with the files that it includes")
         return top.children[0]
 
