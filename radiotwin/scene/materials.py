@@ -242,7 +242,7 @@ def map_materials(shapes: Sequence[DeclaredShape], declared: Mapping[str, Node],
     used: set[str] = set()
     found: list[Problem] = []
     older: list[str] = []
-    materials = []
+    materials: list[Material | None] = []
     for shape in shapes:
         if shape.material is None:
             materials.append(None)

@@ -7,7 +7,7 @@ flat ground: terrain of the file itself is not used.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 import shapely
@@ -43,7 +43,7 @@ _WALL_SINE = 0.02  # a triangle with a smaller share of its area seen from above
 _DECIMALS = 4  # of corners [m]: equal ones are welded, as by `meshes.WELD_M`
 
 
-ModelSurfaces = Manifold | tuple[np.ndarray, np.ndarray]
+ModelSurfaces: TypeAlias = Manifold | tuple[np.ndarray, np.ndarray]
 """Surfaces of a 3D model, in the local frame [m]: closed, or open: corners (v, 3), faces (f, 3)."""
 
 

@@ -195,11 +195,11 @@ def read_heights(path: Path, origin: Origin, box_m: Bounds, unit: str | None = N
         factor, reference, kind = _vertical(path, file, system, unit)
         x_m, y_m, every, pixel_m = _nodes(file, system, origin, box_m)
         to_system = Transformer.from_crs("EPSG:4326", system.to_2d(), always_xy=True)
-        east, north = map(np.asarray, to_system.transform(
+        x, y = map(np.asarray, to_system.transform(
             *to_geographic(origin, *np.meshgrid(x_m, y_m))))
         inverse = ~file.transform
-        column = inverse.a * east + inverse.b * north + inverse.c
-        row = inverse.d * east + inverse.e * north + inverse.f
+        column = inverse.a * x + inverse.b * y + inverse.c
+        row = inverse.d * x + inverse.e * y + inverse.f
         height, first, voids = _window(path, file, column, row, every, pixel_m / factor)
     height = height * factor
     wrong = (height < HEIGHTS_M[0]) | (height > HEIGHTS_M[1])
