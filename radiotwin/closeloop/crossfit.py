@@ -75,7 +75,8 @@ def make_folds(links: Links, seed: int, by: str = "auto") -> Folds:
         links: n links.
         seed: random seed of the assignment.
         by: one of `WAYS`; or `auto`: by flight if devices and receivers typically are in at least
-            `MIN_FLIGHTS` flights, else by blocks of ground. By device only anchors are held out.
+            `MIN_FLIGHTS` flights, else by blocks of ground or of time. By device, links of unknown
+            devices are never held out.
 
     Raises:
         BadInput: an unknown way, or too few flights, quadrants or anchors for it.
@@ -135,9 +136,9 @@ def _require_several(index: np.ndarray, by: str) -> np.ndarray:
 
 
 def _can_hold_out_flights(links: Links) -> bool:
-    """Return whether devices and receivers typically recur in at least `MIN_FLIGHTS` flights.
+    """Return whether the median link's device and receiver are in `MIN_FLIGHTS` flights or more.
 
-    False also if one flight has more than half of the detected links.
+    False if one flight has over half of the detected links. Over `MAX_ENDS` ends are not checked.
     """
     if len(np.unique(links.flight)) < MIN_FLIGHTS:
         return False
@@ -308,11 +309,11 @@ class CrossFit:
     def held_out_reading(self) -> tuple[np.ndarray, np.ndarray]:
         """(n,) held-out level, predicted as if there were no limit of detection; its scale [dB].
 
-        Interpolated shadowing is included. NaN where the fold could not locate the device.
+        Interpolated shadowing is included. NaN if never held out, or the device is not located.
         """
         mean_db, scale_db, unheard_db = self._held_out_parts
-        shift, left = self.held_out_shadowing
-        return mean_db + shift * scale_db, np.hypot(scale_db * left, unheard_db)
+        shift, scale_left = self.held_out_shadowing
+        return mean_db + shift * scale_db, np.hypot(scale_db * scale_left, unheard_db)
 
     @property
     def held_out_scales(self) -> np.ndarray:
@@ -353,10 +354,10 @@ class CrossFit:
         """
         if not self.reads_quality:
             return self.held_out_mean_db, self.held_out_nll
-        shares = (np.arange(QUALITIES) + 0.5) / QUALITIES
-        each = [_with_quality(self, share) for share in shares.tolist()]
-        return (np.mean([model.held_out_mean_db for model in each], axis=0),
-                np.log(QUALITIES) - logsumexp([-model.held_out_nll for model in each], axis=0))
+        quantiles = (np.arange(QUALITIES) + 0.5) / QUALITIES
+        models = [_with_quality(self, quantile) for quantile in quantiles.tolist()]
+        return (np.mean([model.held_out_mean_db for model in models], axis=0),
+                np.log(QUALITIES) - logsumexp([-model.held_out_nll for model in models], axis=0))
 
     @cached_property
     def not_learnable(self) -> np.ndarray:
@@ -382,13 +383,13 @@ class CrossFit:
 
     @cached_property
     def held_out_shadowing(self) -> tuple[np.ndarray, np.ndarray]:
-        """(n,) held-out interpolated shadowing [error scales]; (n,) factor left of the scale."""
-        shift, left = np.zeros(len(self.index)), np.ones(len(self.index))
+        """(n,) held-out interpolated shadowing over the error scale; (n,) scale left, 0 to 1."""
+        shift, scale_left = np.zeros(len(self.index)), np.ones(len(self.index))
         for number, fold in enumerate(self.folds):
             rows = np.flatnonzero(self.index == number)
             if fold.shadowing is not None:
-                shift[rows], left[rows] = fold.shadowing.at(fold.links.select(rows))
-        return shift, left
+                shift[rows], scale_left[rows] = fold.shadowing.at(fold.links.select(rows))
+        return shift, scale_left
 
 
 def match_effects(whole: Fit, fold: Fit) -> list[int | None]:
@@ -420,18 +421,18 @@ def match_effects(whole: Fit, fold: Fit) -> list[int | None]:
 
 
 def _rms(error: np.ndarray, rows: np.ndarray | None = None) -> float:
-    """Return the root mean square of the known values of an error (n,), in a mask (n,)."""
+    """Return the RMS of the known values of an error (n,) in a mask (n,); NaN if none is known."""
     error = error if rows is None else error[rows]
     return float(np.sqrt(np.nanmean(error**2))) if np.isfinite(error).any() else np.nan
 
 
-def _with_quality(model: CrossFit, share: float) -> CrossFit:
-    """Set the quality of all held-out links to one quantile of that of training links; no refit."""
+def _with_quality(model: CrossFit, quantile: float) -> CrossFit:
+    """Set the quality of held-out links to a quantile (0 to 1) of the training links'; no refit."""
     def with_quantile(each: Fit) -> Fit:
         quality = each.links.quality
         assert quality is not None
         known = quality[each.train & np.isfinite(quality)]
-        usual = float(np.quantile(known, share)) if len(known) else np.nan
+        usual = float(np.quantile(known, quantile)) if len(known) else np.nan
         links = each.links.with_columns(quality=np.where(each.train, quality, usual))
         terms = tuple(term if "quality" not in effect.uses
                       else effect.term(links, each.model.level_at)
@@ -494,8 +495,7 @@ def best_base(models: dict[str, CrossFit]) -> str:
 def paths_gain_db(links: Links, scene: Scene, folds: Folds, seed: int) -> float:
     """Return the held-out RMSE that following paths (reflections, …) saves on a sample [dB].
 
-    Paths of all links take minutes to hours, and over maps with guessed building heights they
-    explain no more than line of sight does.
+    Paths of all links take hours, and explain little over maps with guessed building heights.
 
     Args:
         links: n links.
@@ -504,20 +504,21 @@ def paths_gain_db(links: Links, scene: Scene, folds: Folds, seed: int) -> float:
         seed: random seed, see `make_bases`.
 
     Returns:
-        RMSE of the segmented law minus RMSE with paths, on links of anchors; inf if too few.
+        RMSE of the segmented law minus RMSE with paths, on detected links of anchors; inf if they
+        are too few to fit.
     """
     known = np.isin(links.device, sorted(links.anchors)) & np.isfinite(links.level_db)
     rows = subsample(np.flatnonzero(known & (folds.index >= 0)), FIRST_LOOK_LINKS)
-    kept = np.unique(folds.index[rows], return_inverse=True)[1].ravel()
-    few, bases = links.select(rows), make_bases(scene, seed)
-    few_folds = Folds(folds.by, kept)
-    if len(rows) < FIRST_LOOK_LINKS or few_folds.count < 2:
+    fold = np.unique(folds.index[rows], return_inverse=True)[1].ravel()
+    sample, bases = links.select(rows), make_bases(scene, seed)
+    sample_folds = Folds(folds.by, fold)
+    if len(rows) < FIRST_LOOK_LINKS or sample_folds.count < 2:
         return np.inf
-    parts = training_parts(few, few_folds)
+    parts = training_parts(sample, sample_folds)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the fit to all links warns
-            law, paths = (cross_validate(few, bases[name], few_folds, parts)
+            law, paths = (cross_validate(sample, bases[name], sample_folds, parts)
                           for name in (TwinBase.name, RaytraceBase.name))
     except BadInput:
         return np.inf

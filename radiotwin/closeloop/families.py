@@ -29,15 +29,15 @@ class Readings:
 
     Attributes:
         residual_db: (n,) measured minus predicted [dB]; NaN if not detected or not predicted.
-        blank_excess: (n,) 1 for a blank, 0 for a level, minus the predicted blank probability.
+        blank_excess: (n,) 1 if not detected (blank), else 0, minus the predicted probability of 1.
         los: (n,) bool, line of sight.
         device, receiver, flight: (n,) int indices into `names`.
-        time_s: (n,) NaN if unknown.
+        time_s: (n,) [s]; NaN if unknown.
         moving_m: (n, 3) position of the moving end of the link [m].
         device_m, receiver_m: (n, 3) positions of both ends [m].
         angles_deg: (n,) "azimuth" and "elevation" at the device, "body azimuth" at the receiver
             [degree]; NaN if unknown.
-        predicted_db: (n,) predicted mean level [dB].
+        predicted_db: (n,) mean level, predicted as if there were no limit of detection [dB].
         names: names by "device", "receiver" and "flight".
     """
 
@@ -77,20 +77,21 @@ class Readings:
         It estimates the receiver's noise, since errors of the map change slowly along a track. NaN
         for the first reading, and where line of sight changes.
         """
-        before = self.previous
-        alike = (before >= 0) & (self.los == self.los[before])
-        return np.where(alike, (self.residual_db - self.residual_db[before]) / np.sqrt(2), np.nan)
+        previous = self.previous
+        same_sight = (previous >= 0) & (self.los == self.los[previous])
+        change_db = self.residual_db - self.residual_db[previous]
+        return np.where(same_sight, change_db / np.sqrt(2), np.nan)
 
     @classmethod
     def of(cls, model: CrossFit) -> Readings:
         """Return the readings of a model's links with their held-out prediction."""
         links, level_db = model.links, model.links.level_db
         mean_db, scale_db = model.held_out_reading
-        predicted_db = model.held_out_mean_db
+        if_detected_db = model.held_out_mean_db
         with np.errstate(invalid="ignore"):
-            blank = ndtr((links.limit_db - mean_db) / scale_db)
-        blank_excess = np.where(np.isnan(level_db), 1.0, 0.0) - blank
-        return cls(level_db - predicted_db, blank_excess, links.los, links.device, links.receiver,
+            blank_probability = ndtr((links.limit_db - mean_db) / scale_db)
+        blank_excess = np.where(np.isnan(level_db), 1.0, 0.0) - blank_probability
+        return cls(level_db - if_detected_db, blank_excess, links.los, links.device, links.receiver,
                    links.flight, links.time_s, moving_end_m(links),
                    links.device_m[links.device], links.receiver_m,
                    {"azimuth": links.azimuth_deg, "elevation": links.elevation_deg,
@@ -140,8 +141,8 @@ class Family:
 def units_of(readings: Readings) -> Units:
     """Label readings that share errors, by squares of ground around the moving end.
 
-    Readings of a flight in one square of `PASSING_M` share errors of that pass. Readings of a
-    device in one square of `LASTING_M` share errors of the map, which last.
+    Readings of one flight in a square of `PASSING_M` share passing errors. Readings of one device
+    in a square of `LASTING_M` share errors of the map, which last over all flights.
     """
     passing, lasting = (_squares_of(readings.moving_m, width_m)
                         for width_m in (PASSING_M, LASTING_M))
@@ -198,22 +199,22 @@ def families_of(readings: Readings, units: Units) -> Iterator[Family]:
 
 def _pairs(readings: Readings, first: str, second: str,
            labels: Mapping[str, np.ndarray], units: Units) -> Iterator[Family]:
-    """Yield the pairs of two kinds (device, receiver, flight), unless each has one partner."""
-    one, other = labels[first], labels[second]
-    code = combined_labels(one, other)
+    """Yield pairs such as device and flight; none if each member of one kind has one partner."""
+    first_label, second_label = labels[first], labels[second]
+    code = combined_labels(first_label, second_label)
     count = int(code.max()) + 1
-    if count in (len(np.unique(one)), len(np.unique(other))):
+    if count in (len(np.unique(first_label)), len(np.unique(second_label))):
         return
     row_of_pair = _row_of_label(code)
 
     def describe(group: int) -> Description:
         row = row_of_pair[group]
-        return {first: (readings.names[first][one[row]],),
-                second: (readings.names[second][other[row]],)}, {}
+        return {first: (readings.names[first][first_label[row]],),
+                second: (readings.names[second][second_label[row]],)}, {}
 
     yield Family(f"{first} x {second}", Groups.of_labels(code, units), describe,
                  statistics=("level", "noise", "scatter"),
-                 pairs=(one[row_of_pair], other[row_of_pair]), is_crossing=True)
+                 pairs=(first_label[row_of_pair], second_label[row_of_pair]), is_crossing=True)
 
 
 def _is_nested(label: np.ndarray, within: np.ndarray) -> bool:
@@ -255,7 +256,7 @@ def _windows(readings: Readings, units: Units) -> Iterator[Family]:
 
 
 def _share_of_time(readings: Readings, label: np.ndarray) -> np.ndarray:
-    """Return the time (n,) as a share, 0 to below 1, of the duration of its label; 0 if unknown."""
+    """Return each time (n,) as a share, 0 to below 1, of its label's duration; 0 if not known."""
     begin_s, end_s = np.full(label.max() + 1, np.inf), np.full(label.max() + 1, -np.inf)
     known = np.isfinite(readings.time_s)
     np.minimum.at(begin_s, label[known], readings.time_s[known])
@@ -278,8 +279,12 @@ def _describe_window(readings: Readings, scope: str, code: np.ndarray) -> Callab
 
 
 def _directions(readings: Readings, units: Units) -> Iterator[Family]:
-    """Yield sectors of azimuth and elevation at each device, and of body azimuth at receivers."""
-    for angle, end, names in (("azimuth", readings.device, "device"),
+    """Yield sectors of azimuth and elevation at each device, and of body azimuth at receivers.
+
+    They are 45° and 22.5° wide, and yielded again shifted by half. An angle is left out if under
+    half of the readings have it.
+    """
+    for angle, end, kind in (("azimuth", readings.device, "device"),
                               ("elevation", readings.device, "device"),
                               ("body azimuth", readings.receiver, "receiver")):
         values = readings.angles_deg[angle]
@@ -295,19 +300,19 @@ def _directions(readings: Readings, units: Units) -> Iterator[Family]:
             code = _renumber(combined_labels(end, sector), known)
 
             def describe(group: int, code: np.ndarray = code, end: np.ndarray = end,
-                         names: str = names, angle: str = angle, shift: float = shift,
+                         kind: str = kind, angle: str = angle, shift: float = shift,
                          width: float = width, values: np.ndarray = values
                          ) -> Description:
                 row = np.flatnonzero(code == group)[0]
                 low = (np.floor(values[row] / width + shift) - shift) * width
-                return ({names: (readings.names[names][end[row]],)},
+                return ({kind: (readings.names[kind][end[row]],)},
                         {f"{angle.replace(' ', '_')}_deg": (float(low), float(low + width))})
             yield Family("direction", Groups.of_labels(code, units), describe, (end, sector),
                          ("level",))
 
 
 def _bands(readings: Readings, units: Units) -> Iterator[Family]:
-    """Yield bands of distance, altitude and predicted level with equally many links."""
+    """Yield bands of distance, moving end's altitude and predicted level, of equally many links."""
     distance_m = np.linalg.norm(readings.receiver_m - readings.device_m, axis=1)
     for name, values, key in (("distance", distance_m, "distance_m"),
                               ("altitude", readings.moving_m[:, 2], "height_m"),
@@ -330,8 +335,8 @@ def _bands(readings: Readings, units: Units) -> Iterator[Family]:
 def _curves(readings: Readings, units: Units) -> Iterator[Family]:
     """Yield curves: levels of each device, receiver or flight in bins along one variable.
 
-    The variable is time, flight, body azimuth or predicted level. There is no curve of a device
-    over direction, since a wrong building nearby would change it.
+    The variable is time, flight, body azimuth or predicted level; left out if under half of the
+    readings have it. A device has no curve over direction: a wrong building nearby would change it.
     """
     track, device, receiver = readings.track, readings.device, readings.receiver
     timed, predicted_db = np.isfinite(readings.time_s), readings.predicted_db
@@ -339,16 +344,16 @@ def _curves(readings: Readings, units: Units) -> Iterator[Family]:
     ends = device, track
     by_receiver, by_flight = (_window_of_reading(readings, label, READINGS_A_BIN)
                               for label in (track, readings.flight))
-    wide = _window_of_reading(readings, readings.flight, READINGS_A_BIN * len(np.unique(device)))
+    windows = _window_of_reading(readings, readings.flight, READINGS_A_BIN * len(np.unique(device)))
     sector = np.floor(np.nan_to_num(body_deg) / CURVE_SECTOR_DEG).astype(np.int64)
     level = np.searchsorted(_quantiles(predicted_db, LEVEL_BANDS), predicted_db)
-    for end, along, bins, known, off in (
+    for end, along, bins, known, subtracted in (
             ("receiver", "time_s", (track, by_receiver), timed, ends),
             ("receiver", "flight", (readings.flight,), None, (device, receiver)),
             ("receiver", "body_azimuth_deg", (sector,), np.isfinite(body_deg), ends),
             ("receiver", "predicted_db", (level,), np.isfinite(predicted_db), ends),
             ("flight", "time_s", (by_flight,), timed, ends),
-            ("device", "time_s", (readings.flight, wide), timed, ends),
+            ("device", "time_s", (readings.flight, windows), timed, ends),
             ("device", "flight", (readings.flight,), None, ends)):
         label = getattr(readings, end)
         known = np.ones(len(readings), dtype=bool) if known is None else known
@@ -358,12 +363,12 @@ def _curves(readings: Readings, units: Units) -> Iterator[Family]:
 
         def describe(group: int, end: str = end) -> Description:
             return {end: (readings.names[end][group],)}, {}
-        yield Family(end, Groups.of_labels(code, units), describe, off, ("curve",),
+        yield Family(end, Groups.of_labels(code, units), describe, subtracted, ("curve",),
                      is_crossing=True, curve=label[known][_row_of_label(code[known])], along=along)
 
 
 def _window_of_reading(readings: Readings, label: np.ndarray, count: int) -> np.ndarray:
-    """Split each label's time into windows of about `count` readings; return each one's window."""
+    """Return windows (n,): each label's time cut into 2 to `MAX_WINDOWS` of `count` readings."""
     number = np.clip(np.bincount(label) // count, 2, MAX_WINDOWS)
     return np.floor(_share_of_time(readings, label) * number[label]).astype(np.int64)
 

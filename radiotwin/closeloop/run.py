@@ -235,7 +235,8 @@ def close_loop(measurements: Measurements | pd.DataFrame | Path | str,
         the anomalies and effects, with errors before and after on held-out links.
 
     Raises:
-        BadInput: an unknown base or way to hold out, or no usable data.
+        BadInput: an unknown base or way to hold out, `raytrace` without a map, an anchor deep
+            inside a building, or no usable data.
     """
     if base not in (*BASES, "auto"):
         raise BadInput(f"base {base!r} is unknown; allowed are auto, {', '.join(BASES)}")

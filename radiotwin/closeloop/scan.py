@@ -59,13 +59,13 @@ ODDS, FAMILY_ODDS = {"device": 0.4, "receiver": 0.4, "flight": 0.4, "place": 1.0
 PLACE_BOTH = 0.3  # `BOTH_SHARE` of places: a wrong building changes mostly NLoS links
 LEAST_SCALE_DB = 0.5  # half a step of receivers that round to 1 dB
 MAX_ANOMALIES = 10
-ECHO = 1 / 3  # of the first anomaly's size, below which a later one may be its remainder
-MAX_RIVALS = 4  # groups that are tried, to take the one that explains most
+LEFTOVER_SHARE = 1 / 3  # of the first anomaly's size, below which a later one may be left of it
+MAX_CANDIDATES = 4  # groups that are tried, to take the one that explains most
 MIN_PROBABILITY = 0.5  # below it a group is not an anomaly
 MIN_LINKS = 60  # detected links with (or without) line of sight, to be judged apart
 ENDS = "device", "receiver", "flight"
 BASE_ERRORS = "distance", "altitude", "level"  # families that are judged by the raw residual
-HEIGHTS_M, QUARTERS = (5.0, 20.0, 60.0), 4  # street, roofs, above: a base's bias differs [m]
+HEIGHTS_M, QUARTILES = (5.0, 20.0, 60.0), 4  # street, roofs, above: a base's bias differs [m]
 UNITS = {"level": "dB", "curve": "dB", "scatter": "times", "noise": "times", "blanks": "share"}
 
 
@@ -102,7 +102,10 @@ class Anomaly:
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """Log odds that groups of a family stand out by one statistic, in LoS, NLoS or all links."""
+    """Log odds (k,) [nats] that k groups (or curves) of a family stand out by one statistic.
+
+    They are of links of one `sight`: `los`, `nlos` or `all`; NaN or -inf if a group is not judged.
+    """
 
     family: Family
     statistic: str
@@ -128,39 +131,39 @@ class _Found:
         return float(self.compared.log_odds[self.group])
 
     @property
-    def size(self) -> float:
+    def deviation(self) -> float:
+        """Deviation from the peers: dB, share of blanks, or logarithm of the scatter's ratio."""
         return float(self.compared.distance.size[self.group])
 
 
 def scan(readings: Readings) -> list[Anomaly]:
     """Find groups of readings whose held-out residuals stand out, the most evident first.
 
-    They have a probability over `MIN_PROBABILITY` and are at most `MAX_ANOMALIES`. One group is
-    taken at a time: the one without whose deviation least remains unexplained. Its deviation is
-    subtracted from the residuals before the next round.
+    At most `MAX_ANOMALIES`, each with a probability over `MIN_PROBABILITY`. Each round subtracts
+    from the residuals the deviation of one group: that which leaves least unexplained.
     """
     units = units_of(readings)
     families = list(families_of(readings, units))
     end_families = [each for each in families
                     if each.curve is None and (each.name in ENDS or each.pairs)]
-    found: list[Anomaly] = []
-    taken: list[_Found] = []
-    left, first = readings, None
-    while len(found) < MAX_ANOMALIES:
-        compared = log_odds_of_groups(left, families, units)
+    anomalies: list[Anomaly] = []
+    found: list[_Found] = []
+    remaining, first = readings, None
+    while len(anomalies) < MAX_ANOMALIES:
+        compared = log_odds_of_groups(remaining, families, units)
         first = first or compared
-        rivals = _candidates(compared, first, taken)
-        if not rivals:
+        candidates = _candidates(compared, first, found)
+        if not candidates:
             break
-        after = [(each, _without_group(left, each)) for each in rivals]
+        subtracted = [(each, _without_group(remaining, each)) for each in candidates]
         best = 0
-        if len(after) > 1:  # the group that explains most in devices, receivers, flights and pairs
+        if len(subtracted) > 1:  # judged on devices, receivers, flights and their pairs only
             best = int(np.argmin([_total_log_odds(log_odds_of_groups(rest, end_families, units))
-                                  - each.log_odds for each, rest in after]))
-        chosen, left = after[best]
-        taken.append(chosen)
-        found.append(_anomaly(chosen, readings))
-    return found
+                                  - each.log_odds for each, rest in subtracted]))
+        chosen, remaining = subtracted[best]
+        found.append(chosen)
+        anomalies.append(_anomaly(chosen, readings))
+    return anomalies
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,10 +239,10 @@ class _ValuesOfOneSight:
             prior = LOS_BLANKS_SPREAD if self.is_los else NLOS_BLANKS_SPREAD
             prior *= 1 if family.name in ENDS else 2
         else:
-            size = np.minimum(np.abs(in_class) / scale_db, MAX_SCALES)
+            magnitude = np.minimum(np.abs(in_class) / scale_db, MAX_SCALES)
             # An instrument's noise is independent from reading to reading.
             lasting_sd = None if self.statistic == "noise" else \
-                self.lasting.sd(size / max(size.mean(), TINY))
+                self.lasting.sd(magnitude / max(magnitude.mean(), TINY))
             found = log_scatters(values, groups, lasting_sd, scale_db)
             prior = NOISE_SPREAD if self.statistic == "noise" else SCATTER_SPREAD
             prior *= 1 if family.name in ENDS else 1.5
@@ -262,12 +265,12 @@ def _classes(readings: Readings, units: Units) -> dict[str, dict[str, _ValuesOfO
               "noise": readings.step_db, "blanks": readings.blank_excess,
               "base": readings.residual_db}
     found: dict[str, dict[str, _ValuesOfOneSight]] = {name: {} for name in values}
-    heard = np.isfinite(readings.residual_db)
+    detected = np.isfinite(readings.residual_db)
     for sight, is_los in (("los", True), ("nlos", False)):
         of_class = readings.los if is_los else ~readings.los
-        if (of_class & heard).sum() < MIN_LINKS:
+        if (of_class & detected).sum() < MIN_LINKS:
             continue
-        scale_db = max(robust_sd(readings.residual_db[of_class & heard]), LEAST_SCALE_DB)
+        scale_db = max(robust_sd(readings.residual_db[of_class & detected]), LEAST_SCALE_DB)
         for name, each in values.items():
             rows = of_class & np.isfinite(each)
             found[name][sight] = _ValuesOfOneSight(
@@ -279,7 +282,8 @@ def _classes(readings: Readings, units: Units) -> dict[str, dict[str, _ValuesOfO
 def log_odds_of_groups(readings: Readings, families: list[Family], units: Units) -> list[Compared]:
     """Return the log odds that each group of the families deviates from its peers.
 
-    Each statistic is compared among LoS links, NLoS links and both together (`all`).
+    Each statistic is compared among LoS links, NLoS links and both together (`all`). Less scatter
+    or fewer blanks than the peers' are no fault: log odds of -inf.
     """
     found, classes = [], _classes(readings, units)
     alike = Counter((family.name, family.curve is None) for family in families)
@@ -318,34 +322,34 @@ def _together(parts: list[PeerComparison | Curves]) -> PeerComparison | Curves:
 
 
 def _usual_errors(readings: Readings) -> np.ndarray:
-    """Return the median residual (n,) of links with like height, distance and line of sight [dB].
+    """Return the median residual (n,) of links of similar height, distance and LoS state [dB].
 
-    The bias of a base differs between streets and above roofs, which is no fault of a flight. It is
-    0 for links that are not detected, or whose median could be the fault of one receiver.
+    It is the base model's bias: by height class of the moving end, and quartile of the distance. It
+    is 0 for links not detected, and where one receiver on several flights may have caused it.
     """
-    heard = np.isfinite(readings.residual_db)
+    detected = np.isfinite(readings.residual_db)
     height = np.searchsorted(HEIGHTS_M, readings.moving_m[:, 2])
     distance_m = np.linalg.norm(readings.receiver_m - readings.device_m, axis=1)
     cell = combined_labels(readings.los.astype(int), height)
-    quarter = np.zeros(len(readings), dtype=np.int64)
-    for each in np.unique(cell[heard]):
-        rows = heard & (cell == each)
-        edges = np.quantile(distance_m[rows], np.linspace(0, 1, QUARTERS + 1)[1:-1])
-        quarter[rows] = np.searchsorted(edges, distance_m[rows])
-    cell = combined_labels(cell, quarter)
-    receivers, flights = (_count_ends(cell[heard], end[heard], int(cell.max()) + 1)
-                          for end in (readings.receiver, readings.track))
-    # In a cell with several flights of one receiver only, the median may be that receiver's fault.
-    rows = heard & ~((receivers == 1) & (flights > 1))[cell]
-    found = np.zeros(len(readings))
-    found[rows] = medians(readings.residual_db[rows], cell[rows], int(cell.max()) + 1)[cell[rows]]
-    return found
+    quartile = np.zeros(len(readings), dtype=np.int64)
+    for each in np.unique(cell[detected]):
+        rows = detected & (cell == each)
+        edges = np.quantile(distance_m[rows], np.linspace(0, 1, QUARTILES + 1)[1:-1])
+        quartile[rows] = np.searchsorted(edges, distance_m[rows])
+    cell = combined_labels(cell, quartile)
+    receivers, flights = (_count_distinct(label[detected], cell[detected], int(cell.max()) + 1)
+                          for label in (readings.receiver, readings.track))
+    rows = detected & ~((receivers == 1) & (flights > 1))[cell]
+    median_db = np.zeros(len(readings))
+    of_cell_db = medians(readings.residual_db[rows], cell[rows], int(cell.max()) + 1)
+    median_db[rows] = of_cell_db[cell[rows]]
+    return median_db
 
 
-def _count_ends(cell: np.ndarray, end: np.ndarray, count: int) -> np.ndarray:
-    """Count the different ends (n,) in each of `count` cells, given the cell (n,) of each link."""
-    size = int(end.max(initial=0)) + 1
-    return np.bincount(np.unique(cell * np.int64(size) + end) // size, minlength=count)
+def _count_distinct(label: np.ndarray, cell: np.ndarray, cells: int) -> np.ndarray:
+    """Count the distinct labels in each cell (cells,), given label and cell of each link (n,)."""
+    labels = int(label.max(initial=0)) + 1
+    return np.bincount(np.unique(cell * np.int64(labels) + label) // labels, minlength=cells)
 
 
 def _less_group_means(values: np.ndarray, labels: list[np.ndarray]) -> np.ndarray:
@@ -358,30 +362,30 @@ def _less_group_means(values: np.ndarray, labels: list[np.ndarray]) -> np.ndarra
 
 
 def _candidates(compared: list[Compared], first: list[Compared],
-                taken: list[_Found]) -> list[_Found]:
-    """Return the most probable group of each family, at most `MAX_RIVALS`, most probable first.
+                known: list[_Found]) -> list[_Found]:
+    """Return the most probable group of each family, up to `MAX_CANDIDATES`, by probability.
 
-    Excluded are groups that were `taken`, and one that did not stand out in the `first` comparison
-    and deviates by less than `ECHO` of the first group found: it may be what the subtraction of
-    that group left over.
+    If any exceeds `MIN_SURE`, the others are dropped. Excluded are groups already found (`known`),
+    and what the subtraction of the first of them may have left: deviations in the same statistic by
+    under `LEFTOVER_SHARE` of its own that did not stand out in the `first` comparison.
     """
     found, before = [], {table.key: table.log_odds for table in first}
     for table in compared:
         likely = table.log_odds > logit(MIN_PROBABILITY)
-        for other in taken:
+        for other in known:
             if other.compared.key[:2] == table.key[:2]:
                 likely[other.group] = False
-        for other in taken[:1]:
+        for other in known[:1]:
             if other.compared.statistic == table.statistic:
                 likely &= (before.get(table.key, table.log_odds) > logit(MIN_PROBABILITY)) | (
-                    np.abs(table.distance.size) > ECHO * abs(other.size))
+                    np.abs(table.distance.size) > LEFTOVER_SHARE * abs(other.deviation))
         found += [_Found(table, int(group)) for group in np.flatnonzero(likely)]
     best: dict[str, _Found] = {}
     for each in sorted(found, key=lambda each: -each.log_odds):
         best.setdefault(each.compared.family.name, each)
-    # Sure groups first: a receiver that scatters, before a flight of it that may explain more.
+    # Only sure groups if any: a receiver that scatters, not a flight of it that may explain more.
     sure = [each for each in best.values() if each.log_odds > logit(MIN_SURE)]
-    return (sure or list(best.values()))[:MAX_RIVALS]
+    return (sure or list(best.values()))[:MAX_CANDIDATES]
 
 
 def _total_log_odds(compared: list[Compared]) -> float:
@@ -390,7 +394,7 @@ def _total_log_odds(compared: list[Compared]) -> float:
 
 
 def _rows(found: _Found, readings: Readings) -> np.ndarray:
-    """Return the mask (n,) of a group's links with the line of sight in which it stands out."""
+    """Return the mask (n,) of a group's links that stand out: its LoS, NLoS or all links."""
     rows = found.compared.family.members(found.group, len(readings))
     sight = found.compared.sight
     return rows & (readings.los if sight == "los" else ~readings.los if sight == "nlos" else True)
@@ -405,11 +409,11 @@ def _without_group(readings: Readings, found: _Found) -> Readings:
         return replace(readings, blank_excess=excess)
     if isinstance(found.compared.distance, Curves):
         return _without_curve(readings, found, found.compared.distance)
-    return shift_group(readings, rows, found.compared.statistic, -found.size)
+    return shift_group(readings, rows, found.compared.statistic, -found.deviation)
 
 
 def _without_curve(readings: Readings, found: _Found, distance: Curves) -> Readings:
-    """Subtract a group's fitted curve from its residuals, for LoS and NLoS links apart."""
+    """Subtract a group's fitted curve from its residuals, separately for LoS and NLoS links."""
     residual_db, groups = readings.residual_db.copy(), found.compared.family.groups
     for sight in distance.bins:
         level_db = np.zeros(len(readings))
@@ -447,7 +451,7 @@ def _anomaly(found: _Found, readings: Readings) -> Anomaly:
             same = inseparable_pairs(labels[compared.family.name], labels[other])
             if found.group in same:
                 members = {**members, other: (readings.names[other][same[found.group]],)}
-    value, distance = found.size, compared.distance
+    value, distance = found.deviation, compared.distance
     if isinstance(distance, Curves):
         low, high = (float(distance.sd(share)[found.group]) for share in (0.05, 0.95))
     else:

@@ -42,6 +42,8 @@ class LeastDeviation:
 def least_deviations(model: CrossFit) -> list[LeastDeviation]:
     """Find the least deviation that the scan would report, for each family (kind of group).
 
+    Curves are left out, and families whose typical group is not found even at `MAX_SIZE`.
+
     Args:
         model: cross-validated fit without anomalies in its held-out residual.
     """
@@ -75,9 +77,9 @@ def _typical_group(distance: PeerComparison) -> tuple[int, float]:
 
 def _least_size(compared: Compared, group: int, sd: float, readings: Readings,
                 units: Units) -> float:
-    """Return the size of a group's deviation from which the scan surely finds it; or inf.
+    """Return the deviation from which the scan finds a group [dB, or log of the scatter's ratio].
 
-    The deviation added to its readings grows by `STEP` until the probability is `MIN_SURE`.
+    It grows by the factor `STEP` until the probability is `MIN_SURE`; inf if above `MAX_SIZE`.
     """
     statistic = compared.statistic
     family = replace(compared.family, statistics=(statistic,))
