@@ -39,7 +39,7 @@ def in_scene_frame(measurements: Measurements, scene: Scene | Path | str,
 
     If both have an origin, positions are converted exactly. If one has none, the frames are assumed
     to be the same, provided that the receivers fit the map: few are inside buildings and few off
-    the map, or no translation of the receivers fits clearly better.
+    the map, or few surely inside, and no translation of the receivers fits clearly better.
 
     Args:
         measurements: with or without an origin.
@@ -82,8 +82,8 @@ def as_measurements(given: Measurements | pd.DataFrame | Path | str,
                     scene: Scene | None) -> Measurements:
     """Return measurements in the frame of a scene, from an object, a file or a data frame.
 
-    Positions of a file or a data frame are checked against the map (`in_scene_frame`), those of a
-    `Measurements` object are only converted. BadInput if `given` is none of these.
+    A file or data frame goes through `in_scene_frame`; a `Measurements` object is only moved to the
+    scene's origin: not checked, no heights above ground converted. BadInput if it is none of these.
     """
     if isinstance(given, Measurements):
         return in_known_frame(given, None if scene is None else scene.config.origin, "the scene")
@@ -98,9 +98,9 @@ def as_measurements(given: Measurements | pd.DataFrame | Path | str,
 
 
 def in_known_frame(measurements: Measurements, origin: Origin | None, owner: str) -> Measurements:
-    """Convert measurements to the frame about an origin, if that and their own origin are known.
+    """Convert measurements to the frame about an origin, if both origins are known and differ.
 
-    A warning says how far they moved, and that the frame belongs to `owner`.
+    A warning says how far they moved (median), and that the frame belongs to `owner`.
     """
     old = measurements.origin
     if old is None or origin is None or is_same_frame(old, origin):
@@ -116,9 +116,9 @@ def in_known_frame(measurements: Measurements, origin: Origin | None, owner: str
 def _require_fit(measurements: Measurements, scene: Scene) -> None:
     """Check that most receivers are outside the buildings and on the map of a scene.
 
-    At most a share `MAX_MISPLACED` may be inside, or off the map. More pass with a warning if
-    position errors of some metres explain it and no translation fits clearly better; else BadInput
-    proposes the best translation.
+    At most a share `MAX_MISPLACED` may be inside (or below ground), or off the map. More are warned
+    of if few are surely inside (positions off by metres) and no translation fits clearly better;
+    else BadInput, with the best translation.
     """
     receiver_m = measurements.receiver_m
     receiver_m = receiver_m[np.isfinite(receiver_m).all(axis=1)]
@@ -158,15 +158,14 @@ def _require_fit(measurements: Measurements, scene: Scene) -> None:
 class ShiftSearch:
     """Result of a search over translations of the receivers.
 
-    The contrast of a translation is the number of receivers inside buildings minus the number that
-    the local building density predicts, in standard deviations. Receivers in streets have a
-    negative one.
+    The contrast of a translation is the number of receivers inside buildings or off the map minus
+    the number inside by the local building density, in standard deviations: negative in streets.
 
     Attributes:
         best_m: east and north translation with the lowest contrast [m].
         best_contrast: of that translation.
         unmoved_contrast: lowest contrast of translations up to `TOLERANCE_M`.
-        tried: number of translations.
+        tried: number of translations in the coarse grid.
     """
 
     best_m: tuple[float, float]

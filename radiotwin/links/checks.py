@@ -79,19 +79,19 @@ def chance_inside(city: CityMap, position_m: np.ndarray,
     y; it is sampled on circles of equal probability.
     """
     places_m, place = np.unique(position_m, axis=0, return_inverse=True)
-    share = (np.arange(RINGS) + 0.5) / RINGS
-    radius_m = sd_m * np.sqrt(-2 * np.log1p(-share))  # quantiles of the Rayleigh distribution
+    probability = (np.arange(RINGS) + 0.5) / RINGS
+    radius_m = sd_m * np.sqrt(-2 * np.log1p(-probability))  # quantiles of the Rayleigh distribution
     low = np.flatnonzero(places_m[:, 2] < city.vertices[:, 2].max(initial=-np.inf))
     chance = np.zeros(len(places_m))
     for ring in range(RINGS):
-        for turn in (np.arange(DIRECTIONS) + ring / RINGS) * (2 * np.pi / DIRECTIONS):
-            shift_m = radius_m[ring] * np.array([np.cos(turn), np.sin(turn), 0.0])
+        for angle in (np.arange(DIRECTIONS) + ring / RINGS) * (2 * np.pi / DIRECTIONS):
+            shift_m = radius_m[ring] * np.array([np.cos(angle), np.sin(angle), 0.0])
             chance[low] += city.inside(places_m[low] + shift_m)
     return chance[place.ravel()] / (RINGS * DIRECTIONS)
 
 
 def refuse_empty_levels(level_db: np.ndarray, column: str) -> None:
-    """Raise BadInput if nothing was detected in levels (n,) [dB], or all of them are equal."""
+    """Raise BadInput if no level (n,) is detected, or > `MIN_LINKS_OF_RECEIVER` are all equal."""
     if not np.isfinite(level_db).any():
         raise BadInput(f"nothing was detected: {column} is empty in all {len(level_db):,} rows, "
                        f"and at least {MIN_LINKS // 2} links need a level. Check that column, and "
@@ -137,9 +137,9 @@ def check_names(measurements: Measurements) -> list[str]:
 
 def check_positions(receiver_m: np.ndarray, device_m: np.ndarray,
                     scene: Scene | None) -> list[str]:
-    """Note positions that are probably in another unit or frame, as all lie within `CLOSE_M`.
+    """Note positions all within `CLOSE_M`, in another unit or frame; with a scene `receiver_notes`.
 
-    Receivers are (n, 3), devices (k, 3) [m]; without a scene they are compared with no map.
+    Receivers are (n, 3), devices (k, 3) [m], compared in x and y; fewer than `MIN_POSITIONS` pass.
     BadInput if all of both lie within `CLOSE_M`, or most receivers are outside the map.
     """
     both = "receivers and devices"
@@ -201,7 +201,7 @@ def map_corners_m(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _roof_m(scene: Scene) -> float:
-    """Return the `ROOFS` quantile of roof heights of the map [m]."""
+    """Return the `ROOFS` quantile of z [m] of the map's building vertices; 0 without buildings."""
     vertices_m = scene.city.vertices
     built_m = vertices_m[vertices_m[:, 2] > GROUND_M, 2]
     if scene.city.terrain is not None:
@@ -210,7 +210,7 @@ def _roof_m(scene: Scene) -> float:
 
 
 def outside_map(receiver_m: np.ndarray, scene: Scene) -> np.ndarray:
-    """Return which receivers (n, 3) [m] are outside the 3D map, (n,) bool."""
+    """Return which receivers (n, 3) [m] are outside the 3D map, (n,) bool; NaN is not."""
     low, high = map_corners_m(scene)
     return np.any((receiver_m[:, :2] < low) | (receiver_m[:, :2] > high), axis=1)
 
@@ -235,7 +235,7 @@ def move_anchors_out(links: Links, scene: Scene, refuse: bool = True) -> Links:
     """Move anchors (devices of declared position) out of buildings and above the map's ground.
 
     An anchor is moved only by as much as a map may be wrong (`radiotwin.scene.footing`), with a
-    note. BadInput if one is far from the receivers or, with `refuse`, too deep inside a building.
+    note. BadInput if one is far from the receivers, or too deep inside (not `refuse`: it stays).
     """
     anchors = np.array(sorted(links.anchors), dtype=int)
     anchors = anchors[np.isfinite(links.device_m[anchors]).all(axis=1)]
@@ -270,28 +270,28 @@ def move_anchors_out(links: Links, scene: Scene, refuse: bool = True) -> Links:
 
 def uninformative_receivers(table: pd.DataFrame, level_db: np.ndarray,
                       keep: np.ndarray) -> list[tuple[np.ndarray, str]]:
-    """Find receivers that detect nothing, read one level only, or have few links that are used.
+    """Find receivers that detect nothing, always read one level, or have few links that are used.
 
-    `level_db` and `keep` (n,) are of the rows of `table`, `keep` of those used so far. The result
-    has for each of the three faults a mask (n,) of such links, and the reason to leave them out.
+    `level_db` [dB] and `keep` (bool: used so far) are (n,), of the rows of `table`. The result has
+    for each of the three faults a mask (n,) of such receivers' links, used or not, and the reason.
     """
-    end, names = pd.factorize(table["receiver"], sort=True)
-    links = np.bincount(end[keep], minlength=len(names))
-    seen = keep & np.isfinite(level_db)
-    low, high = np.full(len(names), np.inf), np.full(len(names), -np.inf)
-    np.minimum.at(low, end[seen], level_db[seen])
-    np.maximum.at(high, end[seen], level_db[seen])
-    heard = np.bincount(end[seen], minlength=len(names))
-    dead = (links > 0) & np.isinf(low)
-    stuck = (heard > MIN_LINKS_OF_RECEIVER) & (low == high)  # not one that heard once
+    receiver, names = pd.factorize(table["receiver"], sort=True)
+    links = np.bincount(receiver[keep], minlength=len(names))
+    detected = keep & np.isfinite(level_db)
+    low_db, high_db = np.full(len(names), np.inf), np.full(len(names), -np.inf)
+    np.minimum.at(low_db, receiver[detected], level_db[detected])
+    np.maximum.at(high_db, receiver[detected], level_db[detected])
+    detections = np.bincount(receiver[detected], minlength=len(names))
+    dead = (links > 0) & np.isinf(low_db)
+    stuck = (detections > MIN_LINKS_OF_RECEIVER) & (low_db == high_db)  # not one that heard once
     few = (links > 0) & (links < MIN_LINKS_OF_RECEIVER) & ~dead
     has = "has {} only" if few.sum() < 2 else "have {} at most"
     reads = "reads" if stuck.sum() < 2 else "read"
-    values = some([f"{value:g}" for value in low[stuck]])
-    return [(dead[end], f"{_named('receiver', names[dead])} never detected anything"),
-            (stuck[end], f"{_named('receiver', names[stuck])} always {reads} {values}"),
-            (few[end], f"{_named('receiver', names[few])} {has.format(links[few].max(initial=0))}; "
-                       f"{MIN_LINKS_OF_RECEIVER} are needed")]
+    values = some([f"{value:g}" for value in low_db[stuck]])
+    return [(dead[receiver], f"{_named('receiver', names[dead])} never detected anything"),
+            (stuck[receiver], f"{_named('receiver', names[stuck])} always {reads} {values}"),
+            (few[receiver], f"{_named('receiver', names[few])} "
+             f"{has.format(links[few].max(initial=0))}; {MIN_LINKS_OF_RECEIVER} are needed")]
 
 
 def unheard_devices(table: pd.DataFrame, level_db: np.ndarray,
@@ -299,38 +299,38 @@ def unheard_devices(table: pd.DataFrame, level_db: np.ndarray,
     """Find devices that were never detected on `MIN_LINKS` or more links, as if switched off.
 
     One with fewer links may be a position of a moving device, where silence is information.
-    Arguments and result are as of `uninformative_receivers`.
+    Arguments are as of `uninformative_receivers`, and so is the result, for one fault.
     """
-    end, names = pd.factorize(table["device"], sort=True)
-    links, heard = (np.bincount(end[rows], minlength=len(names))
-                    for rows in (keep, keep & np.isfinite(level_db)))
-    dead = (links >= MIN_LINKS) & (heard == 0)
+    device, names = pd.factorize(table["device"], sort=True)
+    links, detections = (np.bincount(device[rows], minlength=len(names))
+                         for rows in (keep, keep & np.isfinite(level_db)))
+    dead = (links >= MIN_LINKS) & (detections == 0)
     was, on = ("was", "is it") if dead.sum() < 2 else ("were", "are they")
-    return dead[end], (f"{_named('device', names[dead])} {was} never detected; {on} on, and in "
-                       "range?")
+    return dead[device], (f"{_named('device', names[dead])} {was} never detected; {on} on, and in "
+                          "range?")
 
 
 def find_fill_value(level_db: np.ndarray) -> tuple[float | None, float]:
-    """Find the level that a receiver writes in place of "not detected"; return it and its share.
+    """Find the level that receivers write for "not detected"; return it and its share of readings.
 
-    It is the lowest of `level_db` (n,), if it is far more frequent than the next ones, or occurs
-    three times and lies far below them (by 3 dB, and by ten usual steps). None without one.
+    It is the lowest of `level_db` (n,), if far more frequent than the next ones, or three times and
+    far below (by 3 dB and ten usual steps). (None, 0) without one, or of less than `MIN_LINKS`.
     """
-    seen = level_db[np.isfinite(level_db)]
-    if len(seen) < MIN_LINKS:
+    read_db = level_db[np.isfinite(level_db)]
+    if len(read_db) < MIN_LINKS:
         return None, 0.0
-    values, counts = np.unique(seen, return_counts=True)
+    values, counts = np.unique(read_db, return_counts=True)
     if len(values) < 3:
         return None, 0.0
     steps = np.diff(values)
     gap = counts[0] >= 3 and steps[0] > 10 * np.median(steps[:20]) and steps[0] > 3.0
-    return (float(values[0]), counts[0] / len(seen)) if gap or _is_heap(counts) else (None, 0.0)
+    return (float(values[0]), counts[0] / len(read_db)) if gap or _is_heap(counts) else (None, 0.0)
 
 
 def ceiling_notes(receiver: np.ndarray, names: Sequence[str], level_db: np.ndarray) -> list[str]:
     """Note receivers that saturate: their highest level is far more frequent than the next ones.
 
-    `receiver` (n,) is an index into `names`; levels (n,) are NaN where nothing was detected.
+    `receiver` (n,) is an index into `names`, levels (n,); below `MIN_LINKS` readings, no note.
     """
     found = []
     for number, levels in pd.Series(level_db).dropna().groupby(receiver[np.isfinite(level_db)]):
@@ -344,7 +344,7 @@ def ceiling_notes(receiver: np.ndarray, names: Sequence[str], level_db: np.ndarr
 
 
 def _is_heap(counts: np.ndarray) -> bool:
-    """Return whether the first value is far more frequent than the next five, by counts (m,)."""
+    """Return whether the first value is far more frequent than each of the next five, by counts."""
     return bool(counts[0] >= MIN_HEAP and counts[0] > HEAP_RATIO * counts[1:6].max())
 
 

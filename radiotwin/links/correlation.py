@@ -48,22 +48,22 @@ def pairs_of_links(place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     Each of at most `MAX_LINKS` sampled links is paired with its `NEIGHBOURS` nearest in `place` (n,
     d) [m], positions of both ends and a last coordinate that tells series apart, and with the links
-    `LAGS` rows on, in its series.
+    `LAGS` rows on, in its series; rows are sorted by series and time.
     """
     n = len(place)
-    every = np.arange(n) if n <= MAX_LINKS else np.sort(
+    sampled = np.arange(n) if n <= MAX_LINKS else np.sort(
         np.random.default_rng(0).choice(n, MAX_LINKS, replace=False))
-    near = cKDTree(place).query(place[every], NEIGHBOURS + 1)[1][:, 1:]
-    first = [np.repeat(every, NEIGHBOURS)]
+    near = cKDTree(place).query(place[sampled], NEIGHBOURS + 1)[1][:, 1:]
+    first = [np.repeat(sampled, NEIGHBOURS)]
     second = [near.ravel()]
     for lag in LAGS:
-        first.append(every[every < n - lag])
+        first.append(sampled[sampled < n - lag])
         second.append(first[-1] + lag)
     a, b = np.concatenate(first), np.concatenate(second)
-    same = (b < n) & (a != b)
-    a, b = a[same], b[same]
-    same = place[a, -1] == place[b, -1]
-    return a[same], b[same]
+    valid = (b < n) & (a != b)
+    a, b = a[valid], b[valid]
+    valid = place[a, -1] == place[b, -1]
+    return a[valid], b[valid]
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,8 +114,8 @@ class Trend:
         part_m, count = position_m[self.rows], len(self.rows)
         nodes = np.arange(0, count, -(-count // NODES))  # evenly along all tracks
         weight = count / len(nodes)
-        turn = self.basis[i] - self.basis[j]
-        found = [1 - 0.5 * (turn * turn).sum(axis=1)]
+        step = self.basis[i] - self.basis[j]
+        found = [1 - 0.5 * (step * step).sum(axis=1)]
         # Single precision is accurate to a few millionths here, in a third of the time.
         to_nodes_m, between_m = (cdist(each, part_m[nodes]).astype(np.float32)
                                  for each in (part_m[used], part_m[nodes]))
@@ -124,8 +124,8 @@ class Trend:
             common = np.exp(to_nodes_m / -length_m) @ basis * weight
             both = basis.T @ np.exp(between_m / -length_m) @ basis
             found.append(1 - np.exp(-distance_m / length_m)
-                         - (turn * (common[a] - common[b])).sum(axis=1)
-                         + 0.5 * weight**2 * ((turn @ both) * turn).sum(axis=1))
+                         - (step * (common[a] - common[b])).sum(axis=1)
+                         + 0.5 * weight**2 * ((step @ both) * step).sum(axis=1))
         return np.array(found)
 
 
@@ -168,8 +168,8 @@ class Variogram:
     def length_m(self, z: np.ndarray) -> float:
         """Fit the correlation length [m] of residuals (n,), divided by their scale.
 
-        It is the shortest of `lengths_m` if they are uncorrelated, or too few bins have enough
-        pairs. The measured semivariance is the robust one of Cressie and Hawkins.
+        It is the shortest of `lengths_m` if they are uncorrelated, or fewer than `MIN_BINS` bins
+        have `MIN_PAIRS` pairs. The measured semivariance is that of Cressie and Hawkins.
         """
         detrended = np.empty(len(z))
         for trend in self.trends:
@@ -215,8 +215,8 @@ def _best_length_m(gamma: np.ndarray, pairs: np.ndarray, model_semivariances: np
                    lengths_m: np.ndarray) -> float:
     """Return the correlation length [m] whose model semivariances fit the measured ones best.
 
-    A nugget and a sill of each length are fitted to `gamma` (b,). It is the first length if no sill
-    reaches a share `MIN_CORRELATED`.
+    For each length a nugget and a sill of the models (1 + k, b) are fitted to `gamma` (b,). It is
+    the first length if no sill reaches a share `MIN_CORRELATED`.
     """
     # Bins are dependent: beyond some hundreds of pairs, more make a bin no more certain.
     weight = np.sqrt(np.minimum(pairs, 500)) / np.maximum(gamma, 0.05 * gamma.max(initial=1e-9))
@@ -236,7 +236,7 @@ def _distance_m(position_m: np.ndarray, first: np.ndarray, second: np.ndarray) -
 
 
 def devices_move(links: Links) -> bool:
-    """Return whether devices are positions of one moving device: most were read once only."""
+    """Return whether devices are places of a moving one: below `MIN_SERIES` links in a series."""
     series = pd.DataFrame({"device": links.device, "receiver": links.receiver,
                            "flight": links.flight})
     return len(series.drop_duplicates()) > len(links) / MIN_SERIES
@@ -268,7 +268,7 @@ def extent_m(position_m: np.ndarray) -> float:
 def median_step_m(links: Links) -> float:
     """Return the median distance [m] between nearest positions of one device and receiver.
 
-    It is the distance of both ends together; 0 if there are fewer than two positions.
+    The distance is over x, y, z of both ends; 0 if no device and receiver have two positions.
     """
     place, offset_m = _separated_places(links, pair_label(links))
     places = pd.DataFrame(np.round(place / MIN_STEP_M)).drop_duplicates().to_numpy() * MIN_STEP_M
@@ -281,10 +281,10 @@ def median_step_m(links: Links) -> float:
 
 
 def correlation_length_m(links: Links, z: np.ndarray) -> float:
-    """Return the distance [m] over which the correlation of residuals (n,) falls to 1/e.
+    """Return the distance [m] over which the correlation of residuals `z` (n,) falls to 1/e.
 
-    Links not detected, or with NaN, are ignored. The result is between the median step of positions
-    (that of an uncorrelated residual) and a quarter of the extent of the campaign.
+    `z` is in error scales, clipped to ±`MAX_Z`; links not detected, or with NaN, are ignored. The
+    result is between the median step (if uncorrelated) and a quarter of the campaign's extent.
     """
     seen = np.isfinite(links.level_db) & np.isfinite(z)
     least_m, rows, variogram = _variogram(links, seen.tobytes())
@@ -293,7 +293,7 @@ def correlation_length_m(links: Links, z: np.ndarray) -> float:
 
 @lru_cache(maxsize=REMEMBERED)
 def _variogram(links: Links, seen: bytes) -> tuple[float, np.ndarray, Variogram | None]:
-    """Prepare a variogram: shortest length [m], detected links (m,) in its order, and it or None.
+    """Return shortest length [m], detected rows (m,) in the variogram's order, variogram or None.
 
     `seen` is the mask of detected links as bytes: the key of a cache, as this takes long.
     """

@@ -49,10 +49,10 @@ class Radio:
 
 def tx_power_dbm(device: str, power_dbm: float | None, eirp_dbm: float | None,
                  cable_loss_db: float, antenna: Antenna | None) -> float | None:
-    """Return the transmit power [dBm] from a declared power or EIRP; None if both are unknown.
+    """Return the declared transmit power [dBm], else that from a declared EIRP, else None.
 
-    EIRP is the power minus the cable loss plus the antenna's peak gain (ITU-R V.573-6, A43).
-    BadInput if both are declared and contradict each other.
+    EIRP is the power minus the cable loss plus the antenna's peak gain, 0 dBi without an antenna
+    (ITU-R V.573-6, A43). BadInput if both are declared and differ by more than `MAX_EIRP_APART_DB`.
     """
     if eirp_dbm is None:
         return power_dbm
@@ -88,17 +88,17 @@ class Declared:
 
     @cached_property
     def fed_db(self) -> np.ndarray:
-        """Part of each device's level that no direction changes, (k,) [dB].
+        """Level of each device before antenna and path gain, (k,) [dBm; dB if levels are gains].
 
-        It is the transmit power, where levels are received powers, minus the cable loss, and minus
-        20 lg of the ratio of the device's carrier to the common one.
+        It is the transmit power, where levels are received powers (0 dBm if unknown), minus the
+        cable loss, and minus 20 lg of the ratio of the device's carrier to the common one.
         """
-        fed_db = np.zeros(len(self.radios))
+        feed_db = np.zeros(len(self.radios))
         for number, radio in enumerate(self.radios):
-            fed_db[number] = radio.fed_dbm if self.has_power else -radio.cable_loss_db
+            feed_db[number] = radio.fed_dbm if self.has_power else -radio.cable_loss_db
             if radio.frequency_hz is not None and np.isfinite(self.frequency_hz):
-                fed_db[number] -= 20 * np.log10(radio.frequency_hz / self.frequency_hz)
-        return fed_db
+                feed_db[number] -= 20 * np.log10(radio.frequency_hz / self.frequency_hz)
+        return feed_db
 
     @property
     def description(self) -> str:
@@ -112,7 +112,7 @@ class Declared:
 
     @property
     def usual_db(self) -> float:
-        """Median of `fed_db` over the devices [dB]; 0 if nothing is declared."""
+        """Median of `fed_db` over the devices, in its unit; 0 if nothing is declared."""
         return float(np.median(self.fed_db)) if self.radios else 0.0
 
     @cached_property
@@ -157,8 +157,8 @@ class Declared:
     def with_radios(self, radios: dict[int, Radio]) -> Declared:
         """Return a copy with new radios of some devices (by index); unchanged if none is declared.
 
-        Where a new radio declares no value, the old value stays. A transmit power is replaced only
-        if the old radio declared one, too.
+        Where a new radio declares no value, or 0 dB of cable loss, the old value stays. A transmit
+        power is replaced only if the old radio declared one, too.
         """
         if not self.radios:
             return self
@@ -198,7 +198,7 @@ def radios_of(devices: pd.DataFrame, patterns: dict[str, Pattern], scene: Scene 
         of_scene = dict(zip((each.device for each in scene.config.devices), scene.device_antennas))
     found = []
     for row in devices.to_dict("records"):
-        number: dict[str, float | None] = {
+        values: dict[str, float | None] = {
             name: None if pd.isna(row.get(name)) else float(row[name])
             for name in ("tx_power_dbm", "eirp_dbm", "cable_loss_db", "azimuth_deg", "tilt_deg",
                          "frequency_hz")}
@@ -210,14 +210,14 @@ def radios_of(devices: pd.DataFrame, patterns: dict[str, Pattern], scene: Scene 
                                f"{name!r} is not given; give it in antenna_files of Measurements")
             antenna = Antenna(patterns[name])
         if antenna is not None:
-            azimuth_deg, tilt_deg = number["azimuth_deg"], number["tilt_deg"]
+            azimuth_deg, tilt_deg = values["azimuth_deg"], values["tilt_deg"]
             antenna = Antenna(antenna.pattern,
                               antenna.azimuth_deg if azimuth_deg is None else azimuth_deg,
                               antenna.tilt_deg if tilt_deg is None else tilt_deg)
-        loss_db = number["cable_loss_db"] or 0.0
-        power_dbm = tx_power_dbm(row["device"], number["tx_power_dbm"], number["eirp_dbm"],
+        loss_db = values["cable_loss_db"] or 0.0
+        power_dbm = tx_power_dbm(row["device"], values["tx_power_dbm"], values["eirp_dbm"],
                                  loss_db, antenna)
-        found.append(Radio(power_dbm, loss_db, antenna, number["frequency_hz"]))
+        found.append(Radio(power_dbm, loss_db, antenna, values["frequency_hz"]))
     return tuple(found) if any(radio != Radio() for radio in found) else ()
 
 
@@ -226,7 +226,7 @@ def complete(names: Sequence[str], radios: tuple[Radio, ...], has_power: bool,
     """Fill in missing transmit powers if any device declares one, and note every assumption.
 
     The scene's declared power is assumed first, else the median of the other devices. Without
-    `has_power`, levels are gains.
+    `has_power` levels are gains, and no power is filled in.
     """
     notes: list[str] = []
     known_dbm = [radio.tx_power_dbm for radio in radios if radio.tx_power_dbm is not None]

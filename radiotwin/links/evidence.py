@@ -91,8 +91,8 @@ def _squares_occupied(position_m: np.ndarray, width_m: float) -> int:
 def _group_indices(links: Links, width_m: float, place_m: float) -> np.ndarray:
     """Return two group indices of each link, (n, 2): its piece of evidence, and its place.
 
-    Both ends of its links are in the same squares of side `width_m`, or `place_m`. A piece is also
-    of one device, receiver and flight.
+    Links with both ends in the same squares, of side `width_m`, or `place_m`, have one index. A
+    piece is also of one device, receiver and flight.
     """
     pieces, squares = (np.column_stack([np.floor(end[:, :2] / side_m).astype(np.int64) for end in
                                         (links.receiver_m,
@@ -111,9 +111,9 @@ def design_effect(block: np.ndarray, z: np.ndarray) -> float:
     divided by their scale, clipped to ±`MAX_Z`.
     """
     z = np.clip(z, -MAX_Z, MAX_Z)
-    size = np.bincount(block)
-    mean = np.bincount(block, weights=z) / np.maximum(size, 1)
-    between = (size * (mean - z.mean()) ** 2).sum() / max((size > 0).sum(), 1)
+    count = np.bincount(block)
+    mean = np.bincount(block, weights=z) / np.maximum(count, 1)
+    between = (count * (mean - z.mean()) ** 2).sum() / max((count > 0).sum(), 1)
     return max(float(between / max(z.var(), 1e-9)), 1.0)
 
 
@@ -132,9 +132,9 @@ def thin_piles(links: Links) -> Links:
     max_count = max(PILE * float(np.median(count)), MIN_PILE)
     if np.maximum(count - max_count, 0).sum() < MIN_SURPLUS * len(links):
         return links
-    share = np.repeat(np.minimum(max_count / count, 1.0), count)
-    place = np.arange(len(links)) - np.repeat(starts, count)
-    kept = np.sort(order[np.floor((place + 1) * share) > np.floor(place * share)])
+    kept_share = np.repeat(np.minimum(max_count / count, 1.0), count)
+    rank = np.arange(len(links)) - np.repeat(starts, count)
+    kept = np.sort(order[np.floor((rank + 1) * kept_share) > np.floor(rank * kept_share)])
     note = (f"receivers stayed at {(count > max_count).sum():,} places, where "
             f"{len(links) - len(kept):,} of {len(links):,} links are left out, evenly in time: "
             f"readings at one place err alike and count as one; {max_count:.0f} of them are used")

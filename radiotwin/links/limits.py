@@ -56,8 +56,8 @@ def crude_level(level_db: np.ndarray, limit_db: np.ndarray, distance_m: np.ndarr
 
     Links (n,) that were not detected count as below the limit, by EM for censored normal levels
     (Dempster, Laird and Rubin 1977, 'Maximum likelihood from incomplete data via the EM algorithm',
-    JRSS B 39, Sec. 4.2). A distance is NaN if unknown, a limit -inf. Returned are the predicted
-    level of each link [dB], and the standard deviation of its error [dB].
+    JRSS B 39, Sec. 4.2), or not at all if the limit is -inf (unknown). An unknown distance is NaN.
+    Returned are the predicted level of each link, and the standard deviation of its error [dB].
     """
     blank = np.isnan(level_db)
     limited = blank & np.isfinite(limit_db)
@@ -132,8 +132,8 @@ def receiver_limit(level_db: np.ndarray, mean_db: np.ndarray, scale_db: np.ndarr
                    ) -> LimitEstimate | None:
     """Estimate the weakest level that one receiver detects; None with few readings or blanks.
 
-    Of n readings [dB] (NaN: not detected), the predicted level and its error scale (Student-t,
-    `DOF`) are given. `links_per_observation`, see `design_effect`, count as one.
+    Levels (n,) are NaN if not detected; predicted levels and their error scales (Student-t, `DOF`)
+    are (n,) [dB], too. `links_per_observation`, see `design_effect`, count as one.
     """
     blank = np.isnan(level_db)
     read_db = np.sort(level_db[~blank])
@@ -161,8 +161,8 @@ def _log_likelihoods(tried_db: np.ndarray, read_db: np.ndarray, mean_db: np.ndar
                      ) -> tuple[np.ndarray, float]:
     """Return the log-likelihood [nats] of candidate limits of detection (k,), and of no limit.
 
-    Readings ascend; of the blanks (m,) the predicted level and its error are given [dB]. A blank is
-    below the limit, or lost at any level; lost share and width of the transition are averaged over.
+    Readings ascend; predicted level and error scale [dB] are of the blanks (m,). A blank is below
+    the limit, or lost at any level; lost share and width of the transition are averaged over.
     """
     readings, blanks = len(read_db), len(mean_db)
     mean_db = np.round(mean_db / BIN_DB) * BIN_DB
@@ -186,8 +186,8 @@ def _log_likelihoods(tried_db: np.ndarray, read_db: np.ndarray, mean_db: np.ndar
 def estimate_limits(links: Links, declared_db: float | None) -> tuple[np.ndarray, list[str]]:
     """Estimate the weakest level that each receiver detects, and test the limit that is declared.
 
-    The present limits are ignored. Returned is the limit (n,) of each link [dB], -inf if neither
-    the readings nor `declared_db` give one, and notes.
+    The present limits are ignored. Returned are the limit (n,) of each link, as levels, and notes.
+    It is -inf if a receiver has no blanks and no declared limit, or blanks at any level.
     """
     declared = -np.inf if declared_db is None else declared_db
     ignored = _reason_to_ignore(links, declared)
@@ -247,7 +247,7 @@ def _usual_db(links: Links, rows: list[np.ndarray], found: list[LimitEstimate | 
     """Return the limit [dB] for receivers without an estimate of their own; None if unknown.
 
     The declared one, unless most sure estimates overrule it; else their median, else the estimate
-    from all links, else the lowest reading.
+    from all links if it is sure, or the lowest reading if there is none.
     """
     sure = [(each, part) for each, part in zip(found, rows, strict=True) if each and each.is_sure]
     if np.isfinite(declared_db):
@@ -264,7 +264,7 @@ def _usual_db(links: Links, rows: list[np.ndarray], found: list[LimitEstimate | 
 
 
 def contradict_limit(read_db: np.ndarray, limit_db: float) -> bool:
-    """Return whether more readings (n,) [dB] are below a limit than outliers explain."""
+    """Return whether more readings (n,) are `FALL_DB` below a limit than outliers explain."""
     below = np.count_nonzero(read_db < limit_db - FALL_DB)
     return bool(below >= max(MIN_BELOW, BELOW_SHARE * len(read_db)))
 
@@ -284,7 +284,7 @@ def _overrules(found: LimitEstimate, read_db: np.ndarray, declared_db: float) ->
 
 def _estimates(links: Links, rows: list[np.ndarray], declared_db: float,
                ) -> tuple[list[LimitEstimate | None], LimitEstimate | None]:
-    """Estimate the limit of each receiver, by its links `rows`, and of all together."""
+    """Estimate the limit of each receiver, by its links `rows`, and of all; None: too few links."""
     blank = np.isnan(links.level_db)
     if not blank.any():
         return [None] * len(rows), None
@@ -366,10 +366,10 @@ def _limit_text(name: str, limit_db: float, found: LimitEstimate | None, unit: s
 
 
 def with_usual_limits(links: Links) -> Links:
-    """Give receivers that detect too little the usual limit of detection, not their own.
+    """Lower limits far above the usual limit of detection to it, and set unknown ones to it.
 
-    Blanks that are predicted above it then need another explanation. If no limit is known, the
-    lowest reading is taken for the limit of all.
+    Blanks that are predicted above it then need another explanation. If no limit is known and there
+    are blanks, the lowest reading is taken for the limit of all.
     """
     usual_db = links.usual_limit_db
     if usual_db is None:

@@ -76,12 +76,12 @@ def receivers_of_frame(frame: pd.DataFrame) -> SiteTable:
 
     Columns of names, levels and devices are not searched. BadInput: see `read_site_table`.
     """
-    taken = {*NAMES, *OPTIONAL, *LEVELS} - {ABOVE_GROUND}
-    others = [name for name in frame if name not in taken and not str(name).startswith("device")]
-    if len(frame) and not others:
+    other = {*NAMES, *OPTIONAL, *LEVELS} - {ABOVE_GROUND}
+    names = [name for name in frame if name not in other and not str(name).startswith("device")]
+    if len(frame) and not names:
         raise BadInput(f"{FRAME}: there is no position; columns latitude, longitude or x_m, y_m "
                        f"are needed, it has {listed(frame)}")
-    cells = frame[others].rename(columns={ABOVE_GROUND: "above_ground_m"}).reset_index(drop=True)
+    cells = frame[names].rename(columns={ABOVE_GROUND: "above_ground_m"}).reset_index(drop=True)
     return read_site_table(FRAME, cells, "row {}".format, None)
 
 

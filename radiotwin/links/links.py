@@ -58,7 +58,7 @@ def _restarts(flights: list[tuple[np.ndarray, np.ndarray]]) -> bool:
 
 def _at_two_places(one: tuple[np.ndarray, np.ndarray],
                    other: tuple[np.ndarray, np.ndarray]) -> bool:
-    """Return whether two tracks (times, positions) of one receiver put it at two places at once."""
+    """Return whether two tracks (times, positions) are far apart at most of their common times."""
     (time_s, position_m), (other_s, other_m) = one, other
     common = (time_s >= other_s[0]) & (time_s <= other_s[-1])
     if common.sum() < 2:
@@ -170,8 +170,8 @@ class Columns:
 
     Attributes:
         level_db: (n,) measured gain [dB] or power [dBm]; NaN = not detected.
-        limit_db: (n,) limit of detection of the link's receiver [dB]; -inf: unknown, and a blank
-            does not bound the level.
+        limit_db: (n,) limit of detection of the link's receiver [as levels]; -inf: unknown, and a
+            blank does not bound the level.
         receiver_m: (n, 3) positions of the receivers [m].
         device, receiver, flight: (n,) index into the names in `Ends`.
         time_s: (n,) time [s]; NaN: unknown.
@@ -213,12 +213,12 @@ class Columns:
     @classmethod
     def unmeasured(cls, receiver_m: np.ndarray, device: np.ndarray,
                    limit_db: float | None = None) -> Columns:
-        """Make n links for a prediction, without receiver, flight, time and heading.
+        """Make n links to predict: level, time, heading NaN; index of receiver and flight -1.
 
         Args:
             receiver_m: (n, 3) positions of the receivers [m].
             device: (n,) index of each link's device.
-            limit_db: limit of detection of all receivers [dB]; None: unknown.
+            limit_db: limit of detection of all receivers [dB or dBm, as levels]; None: -inf.
         """
         n = len(receiver_m)
         unset, unknown = np.full(n, -1), np.full(n, np.nan)
@@ -431,7 +431,7 @@ class Links:
 
     @property
     def usual_limit_db(self) -> float | None:
-        """Median limit of detection of the receivers [dB]; None if none is known."""
+        """Lower median of the receivers' known limits of detection, as levels; None: unknown."""
         known_db = self.receiver_limits_db[np.isfinite(self.receiver_limits_db)]
         return float(np.quantile(known_db, 0.5, method="lower")) if len(known_db) else None
 
@@ -476,7 +476,7 @@ class Links:
 
     @cached_property
     def receiver_axes(self) -> np.ndarray:
-        """(n, 3, 3) vectors (east, north, up) to the receiver's right, nose, top; NaN: unknown."""
+        """(n, 3, 3) right, nose, top in (east, north, up); NaN: no heading; unknown tilts are 0."""
         heading, pitch, roll = (
             np.radians(np.zeros(len(self)) if angle is None else angle) for angle in
             (self.heading_deg, *(angle if angle is None else np.nan_to_num(angle)
@@ -497,7 +497,7 @@ class Links:
 
     @cached_property
     def diffraction_parameter(self) -> np.ndarray:
-        """(n,) largest knife-edge ν over the roofs (ITU-R P.526-15, Eq. 26); NaN without a map."""
+        """(n,) largest knife-edge ν over roofs (ITU-R P.526-15, Eq. 26); NaN: no map or carrier."""
         greatest = np.full(len(self), np.nan)
         if self.city is None or np.isnan(self.frequency_hz):
             return greatest

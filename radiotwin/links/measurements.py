@@ -199,8 +199,8 @@ class Measurements(Summarised):
     def on_ground(self, ground_height_m: GroundHeight | None) -> "Measurements":
         """Convert heights above the ground to heights above the datum of the frame.
 
-        See `with_datum_heights`. `ground_height_m` gives the ground at x, y [m]; None: it is
-        unknown.
+        See `with_datum_heights`. `ground_height_m` gives the ground's z at x, y [m]; None: it is
+        flat, at z = 0.
         """
         if "receiver_above_ground_m" not in self.table and "above_ground_m" not in self.devices:
             return self
@@ -230,7 +230,7 @@ class Measurements(Summarised):
     def save(self, path: Path | str) -> None:
         """Write the links to a path, and the devices to `devices.csv` in the same folder.
 
-        The path ends in `.csv`, `.csv.gz` or `.parquet`. A known origin goes to `frame.toml` there.
+        The path ends in `.csv`, `.csv.gz` or `.parquet`. Origin (`frame.toml`) and antennas follow.
 
         Raises:
             BadInput: `path` cannot be written, or the folder has a `devices.csv` of other devices,
@@ -278,8 +278,8 @@ class Measurements(Summarised):
         if self.table.empty:
             raise BadInput("there are no links to draw")
         if device is None:
-            heard = self.table["device"][np.isfinite(self.level_db)]
-            device = str((heard if len(heard) else self.table["device"]).mode()[0])
+            detected = self.table["device"][np.isfinite(self.level_db)]
+            device = str((detected if len(detected) else self.table["device"]).mode()[0])
         origin = self.origin or (scene.config.origin if scene is not None else None)
         frame = PlotFrame.choose(origin, geographic)
         links = of_device(self._links_with_devices(), device)
@@ -429,9 +429,9 @@ def _devices_of_links(table: pd.DataFrame) -> pd.DataFrame:
 
 def _devices(path: Path | str, cells: pd.DataFrame, origin: Origin | None, own: Origin | None,
              where: Callable[[int], str]) -> tuple[pd.DataFrame, tuple[str, ...]]:
-    """Make the table of devices, and notes, from cells, with x and y from the frame `own`.
+    """Make the table of devices, and notes, from cells; x, y move from origin `own` to `origin`.
 
-    They are converted to `origin`. Without a column `role`, devices with a position are anchors.
+    Without a column `role`, devices with a position are anchors.
     """
     sites = read_site_table(path, cells, where, "device", [*DEVICE_OPTIONAL, "antenna", "role"])
     names, values = sites.names, sites.values
@@ -475,7 +475,7 @@ def read_antenna_files(path: Path, names: Iterable[str], are_rows: bool = True
 
 def _check_spread(path: Path, table: pd.DataFrame, devices_path: Path,
                   devices: pd.DataFrame) -> None:
-    """Raise BadInput if some anchors are more than `MAX_APART_M` from the middle of the receivers.
+    """Raise BadInput if some anchors, not all, are `MAX_APART_M` from the middle of the receivers.
 
     If all are, links and devices are in different frames, which is checked later, with the scene.
     """

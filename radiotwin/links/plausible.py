@@ -53,7 +53,7 @@ _RANGES: dict[str, tuple[float, float, str]] = {
 
 def refuse_implausible(refuse: Callable[[np.ndarray, str], None], name: str,
                   numbers: np.ndarray) -> None:
-    """Refuse values (n,) outside the plausible range of their column, which may be in a wrong unit.
+    """Refuse values (n,) outside the plausible range of their column `name`; NaN passes.
 
     `refuse` is called with a mask (n,) of bad values and the reason; it raises if any is true.
     """
@@ -157,16 +157,16 @@ def distances_m(place_deg: np.ndarray, middle_deg: np.ndarray) -> np.ndarray:
 
     A latitude beyond 90 degrees is infinitely far away (inf).
     """
-    (north, east), (middle_north, middle_east) = np.radians(place_deg).T, np.radians(middle_deg)
-    chord = (np.sin((north - middle_north) / 2)**2
-             + np.cos(north) * np.cos(middle_north) * np.sin((east - middle_east) / 2)**2)
+    (lat, lon), (middle_lat, middle_lon) = np.radians(place_deg).T, np.radians(middle_deg)
+    chord = (np.sin((lat - middle_lat) / 2)**2
+             + np.cos(lat) * np.cos(middle_lat) * np.sin((lon - middle_lon) / 2)**2)
     apart_m = 2 * _EARTH_M * np.arcsin(np.sqrt(np.clip(chord, 0, 1)))
     return np.where(np.abs(place_deg[:, 0]) > MAX_DEGREES["latitude"], np.inf, apart_m)
 
 
 def unmatched_notes(path: Path | str, names: Iterable[str], read: Collection[str], end: str
                     ) -> list[str]:
-    """Note names that only a table of sites has, and names that only the log (`read`) has."""
+    """Note names that only a table of sites has; then also those that only the log (`read`) has."""
     idle = list(dict.fromkeys(name for name in names if name not in read))
     lacking = sorted(set(read) - set(names))
     notes, file = [], Path(path).name

@@ -67,7 +67,8 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
             be.
 
     Returns:
-        the usable links; their `notes` say what was left out or odd, a sentence each.
+        the usable links; their `notes` say what was left out or odd. Levels at a fill value become
+        NaN, and empty heights `ASSUMED_HEIGHT_M` above ground (receivers' only without a scene).
 
     Raises:
         BadInput: too few links are usable, positions or levels are implausible, or measurements and
@@ -91,8 +92,8 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
     device_m = np.where(measurements.is_anchor[:, None], measurements.device_m, np.nan)
     device_m[:, 2] = np.where(np.isnan(declared_z_m), ASSUMED_HEIGHT_M, declared_z_m)
     if scene is not None and scene.city.terrain is not None:
-        low = np.flatnonzero(np.isnan(declared_z_m))
-        device_m[low, 2] += _ground_m(scene, device_m[low], receiver_m)
+        no_height = np.flatnonzero(np.isnan(declared_z_m))
+        device_m[no_height, 2] += _ground_m(scene, device_m[no_height], receiver_m)
     notes += check_names(measurements)
     notes += [note for note in high_notes(_clearance_m(declared_z_m, device_m, receiver_m, scene))
               if not any(told.endswith(note) for told in notes)]
@@ -104,21 +105,21 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
     leave_out(from_device_m > FAR_M, f"their receiver is more than {FAR_M / 1000:.0f}"
               " km from the device; both need one frame, in metres")
     leave_out(copied_rows(table), COPIED)
-    low_z = np.isnan(receiver_m[:, 2])
-    if low_z.any() and scene is not None:
-        leave_out(low_z, "their receiver's height is empty, and the 3D map needs it: fill in "
+    no_z = np.isnan(receiver_m[:, 2])
+    if no_z.any() and scene is not None:
+        leave_out(no_z, "their receiver's height is empty, and the 3D map needs it: fill in "
                   "receiver_z_m, or import the file again with above_ground=always 1.5")
-    elif low_z.any():
-        notes.append(f"heights of receivers are empty in {low_z.sum():,} rows, and taken for "
+    elif no_z.any():
+        notes.append(f"heights of receivers are empty in {no_z.sum():,} rows, and taken for "
                      f"{ASSUMED_HEIGHT_M} m")
         receiver_m = np.where(np.isnan(receiver_m), ASSUMED_HEIGHT_M, receiver_m)
     if scene is not None and not to_locate:
         leave_out(unmapped_ends(receiver_m, device_m[device_index], scene),
                   "they end below the roofs and off the 3D map, where it is not known what is in "
                   "the way; a scene built with a wider --bbox would keep them")
-    flat = np.isnan(declared_z_m).sum()
-    if flat:
-        notes.append(f"heights of devices are empty in {flat:,} rows, and taken for "
+    unset = np.isnan(declared_z_m).sum()
+    if unset:
+        notes.append(f"heights of devices are empty in {unset:,} rows, and taken for "
                      f"{ASSUMED_HEIGHT_M} m above the ground")
     placed = np.asarray(np.isfinite(device_m).all(axis=1) | (scene is not None) | to_locate)
     leave_out(~placed[device_index],
@@ -132,10 +133,11 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
         notes.append(f"{at_fill.sum():,} links read exactly {fill_db:g}, the lowest value, "
                      f"{percent(share)} of all: taken for not detected")
     leave_out(*unheard_devices(table, level_db, keep))
-    least, heard = 1 if to_locate else MIN_LINKS, int(np.isfinite(level_db[keep]).sum())
-    if keep.sum() < least or heard < least // 2:
-        raise BadInput(f"{int(keep.sum())} links can be used, {heard} of them detected; at least "
-                       f"{least} are needed" + f", {least // 2} of them detected" * (least > 1)
+    min_links, detected = 1 if to_locate else MIN_LINKS, int(np.isfinite(level_db[keep]).sum())
+    if keep.sum() < min_links or detected < min_links // 2:
+        raise BadInput(f"{int(keep.sum())} links can be used, {detected} of them detected; "
+                       f"at least {min_links} are needed"
+                       + f", {min_links // 2} of them detected" * (min_links > 1)
                        + ": " + ("; ".join(notes) or "measure more"))
     refuse_empty_levels(level_db[keep], measurements.level_column)
     links = _join(measurements.select(keep), scene, level_db[keep], receiver_m[keep],
@@ -173,8 +175,8 @@ def _join(measurements: Measurements, scene: Scene | None, level_db: np.ndarray,
           ) -> Links:
     """Make the links of n measurements, with radios and limits of detection.
 
-    Levels (n,), receivers (n, 3) and devices (k, 3) are corrected ones; `kept` is the mask of these
-    among all devices. Notes are added to `notes` in place.
+    Levels (n,), receivers (n, 3) and devices (k, 3) are corrected ones; `kept` is the mask of
+    usable devices among all. Notes are added to `notes` in place.
     """
     table, devices = measurements.table, measurements.devices[kept]
     receiver, receiver_names = pd.factorize(table["receiver"], sort=True)

@@ -417,11 +417,11 @@ def _columns(path: Path | str, header: Sequence[str],
 
 
 def _name_column(path: Path | str, cells: pd.DataFrame, end: str, names: Collection[str],
-                 taken: set[str]) -> tuple[str, dict[str, str]]:
+                 used: set[str]) -> tuple[str, dict[str, str]]:
     """Return the column of names (`end`, or with most of `names`), and others -> why not used."""
     words = _words(_NAMES[end])
     found = sorted((name for name in map(str, cells)
-                    if _plain(name) in words and name not in taken),
+                    if _plain(name) in words and name not in used),
                    key=lambda name: words.index(_plain(name)))
     if not found:
         raise BadInput(f"{path}: column {end!r} is missing: which one has the names of the {end}s? "
@@ -528,7 +528,7 @@ def dms_degrees(text: str, quantity: str) -> float:
 
 
 def _check_positions(table: SiteTable) -> None:
-    """Raise BadInput unless all sites have a position and at most one height, within range."""
+    """Raise BadInput without columns of positions, or for a row of two heights or bad degrees."""
     given = table.columns.keys()
     for pair in (("latitude", "longitude"), ("x", "y")):
         if len(given & set(pair)) == 1:

@@ -116,7 +116,7 @@ def shared_names(links: Links) -> dict[int, str]:
     """Find devices that may be two transmitters with one name: index -> the reason, for a note.
 
     A receiver then reads two levels at one time, or at one place: these scatter by more than
-    `SHARED_DB`, and by `SHARED_RATIO` times as much as usual.
+    `SHARED_DB`, and by more than `SHARED_RATIO` times the median of other devices.
     """
     found: dict[int, str] = {}
     timed = links.select(np.isfinite(links.time_s))
@@ -146,13 +146,13 @@ def inseparable_pairs(one: np.ndarray, other: np.ndarray) -> dict[int, int]:
 
 
 def inseparable_end(links: Links, end: str, members: set[int]) -> str | None:
-    """Return the other end (device or receiver) if a member and one there have the same links.
+    """Return the opposite end if a device and a receiver have exactly the same detected links.
 
-    Errors of a device and a receiver with exactly the same detected links are indistinguishable.
-    `members` are indices at `end`. None: all are distinguishable.
+    Their errors are then indistinguishable. `end` is device or receiver, `members` are indices
+    there. None: all are distinguishable.
     """
-    other, heard = OTHER_END[end], np.isfinite(links.level_db)
-    together = inseparable_pairs(getattr(links, end)[heard], getattr(links, other)[heard])
+    other, detected = OTHER_END[end], np.isfinite(links.level_db)
+    together = inseparable_pairs(getattr(links, end)[detected], getattr(links, other)[detected])
     return other if members & together.keys() else None
 
 
@@ -161,11 +161,11 @@ def end_notes(links: Links) -> list[str]:
     notes = [f"device {links.device_names[device]} may be two transmitters of one name, such as "
              f"cells of one identity or carriers of a cell: {why}; if so, give each its name"
              for device, why in shared_names(links).items()]
-    heard = np.isfinite(links.level_db)
+    seen = np.isfinite(links.level_db)
     for end in ("receiver", "flight"):
         names = getattr(links, f"{end}_names")
         pairs = [f"{links.device_names[device]} and {names[member]}" for device, member
-                 in inseparable_pairs(links.device[heard], getattr(links, end)[heard]).items()]
+                 in inseparable_pairs(links.device[seen], getattr(links, end)[seen]).items()]
         if pairs:
             notes.append(f"device and {end} are never apart ({some(pairs)}): what one of the two "
                          f"has wrong, an offset or a drift, may be the other's; let another {end} "
