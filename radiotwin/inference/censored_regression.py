@@ -139,14 +139,14 @@ class CensoredRegression:
         times the probability that it is blank because of its level and was not lost.
         """
         predicted = self.predict(result)
-        mean, blank = predicted.mean_db, np.isnan(self.level_db)
-        limit = np.where(np.isfinite(self.limit_db), self.limit_db, mean)
-        excess_db = np.minimum(limit - mean, 0.0)
+        mean_db, blank = predicted.mean_db, np.isnan(self.level_db)
+        limit_db = np.where(np.isfinite(self.limit_db), self.limit_db, mean_db)
+        excess_db = np.minimum(limit_db - mean_db, 0.0)
         excess_law = self.reading_law(-excess_db, predicted.scale_db)
-        below = (1 - self.losses.blank) * excess_law.below(np.zeros(len(mean)))
+        below = (1 - self.losses.blank) * excess_law.below(np.zeros(len(mean_db)))
         missed = np.maximum(self.losses.blank + below, MIN_PROBABILITY)
-        dropped_db = self.reading_law(mean, predicted.scale_db).expected_drop_db(self.level_db)
-        return np.where(blank, excess_db * below / missed, self.level_db - mean + dropped_db)
+        dropped_db = self.reading_law(mean_db, predicted.scale_db).expected_drop_db(self.level_db)
+        return np.where(blank, excess_db * below / missed, self.level_db - mean_db + dropped_db)
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,9 +180,10 @@ class FitResult:
 
 
 def fit(problem: CensoredRegression, start: FitResult | None = None) -> FitResult:
-    """Maximise the posterior of coefficients and error scales by damped Newton steps.
+    """Maximise the posterior by at most MAX_ITERATIONS damped Newton steps.
 
-    `start`: an earlier fit; the coefficients that it lacks are the last ones and start at 0.
+    `start`: an earlier fit, ignored if it has more coefficients or fewer scales; coefficients that
+    it lacks are the last ones and start at 0. A group's scale stays with one detected row or none.
     """
     p, groups = len(problem.prior_sd_db), int(problem.group.max()) + 1
     if start is not None and len(start.coefficients) <= p and len(start.scale_db) >= groups:
@@ -199,16 +200,16 @@ def fit(problem: CensoredRegression, start: FitResult | None = None) -> FitResul
         step = np.linalg.solve(hessian, slope)
         if 0.5 * slope @ step + scale_gain_nats < TOLERANCE:
             break
-        size, before = 1.0, objective
-        while size > MIN_STEP:
-            new_beta = beta + size * step
-            new_scale_db = np.maximum(scale_db * np.exp(size * growth), MIN_SCALE_DB)
+        fraction, before = 1.0, objective
+        while fraction > MIN_STEP:
+            new_beta = beta + fraction * step
+            new_scale_db = np.maximum(scale_db * np.exp(fraction * growth), MIN_SCALE_DB)
             reached = problem.linearise(new_beta, new_scale_db)
             tried = _objective(problem, reached, new_beta, precision)
             if tried <= objective + 1e-9:
                 beta, scale_db, predicted, objective = new_beta, new_scale_db, reached, tried
                 break
-            size *= 0.5
+            fraction *= 0.5
         if before - objective < TOLERANCE:
             break
     return FitResult(beta, scale_db, objective)

@@ -72,7 +72,7 @@ class CorrelatedEvidence:
 
         Residuals z (n,), NaN: not used, at positions (n, 3) [m] have a field for each label of
         `series` (n,); `nuisance` is fitted in every likelihood. `seed` draws rows if there are more
-        than `MAX_ROWS`.
+        than `MAX_ROWS`; parts of fewer than `MIN_POINTS` are left out.
         """
         rng = np.random.default_rng(seed)
         chosen = []
@@ -121,15 +121,16 @@ class CorrelatedEvidence:
         rotated, values = self.rotated(z), self.rotated(columns.values)
         theta = self.of_rotated(rotated, values, columns.prior_sd)[1]
         weighted = values.T / (np.exp(theta[0]) * (1.0 + np.exp(theta[1]) * self.spectrum))
-        spread = np.linalg.inv(weighted @ values + np.diag(1.0 / np.square(columns.prior_sd)))
-        return spread @ (weighted @ rotated), np.sqrt(np.diag(spread))
+        covariance = np.linalg.inv(weighted @ values + np.diag(1.0 / np.square(columns.prior_sd)))
+        return covariance @ (weighted @ rotated), np.sqrt(np.diag(covariance))
 
     def of_rotated(self, z: np.ndarray, columns: np.ndarray, prior_sd: np.ndarray,
                    start: np.ndarray = START) -> tuple[float, np.ndarray]:
         """Fit noise and field variance by marginal likelihood, in the eigenbasis of the field.
 
         Residuals (m,) and columns (m, q) are transformed by `rotated`; `start` as in `START`.
-        Returns the log marginal likelihood [nats], and the best (2,) logarithms of the variances.
+        Returns the log marginal likelihood [nats] and the fitted (2,) `theta` of `at`; without rows
+        0 and `START`.
         """
         if not len(z):
             return 0.0, START
@@ -154,7 +155,7 @@ class CorrelatedEvidence:
         """
         variance = np.exp(theta[0]) * (1.0 + np.exp(theta[1]) * self.spectrum)
         share = 1.0 - np.exp(theta[0]) / variance  # of the variance that is the field's
-        value, left, freedom = np.log(variance).sum() + (z * z / variance).sum(), z, np.zeros(2)
+        value, residual, freedom = np.log(variance).sum() + (z * z / variance).sum(), z, np.zeros(2)
         if columns.shape[1]:
             # A matrix times its own transpose takes half of the time of another product
             root = np.sqrt(variance)
@@ -165,12 +166,12 @@ class CorrelatedEvidence:
             best = cho_solve(factor, moments)
             value += 2 * np.log(np.diag(factor[0])).sum() + 2 * np.log(prior_sd).sum()
             value -= moments @ best
-            left = z - columns @ best
+            residual = z - columns @ best
             weighted *= np.sqrt(share)
             of_field = weighted @ weighted.T
             freedom = np.array([np.trace(cho_solve(factor, squares))
                                 for squares in (inner, of_field)])
-        excess = 1.0 - left * left / variance
+        excess = 1.0 - residual * residual / variance
         slope = np.array([excess.sum(), share @ excess]) - freedom
         return -0.5 * float(value) - 0.5 * len(z) * np.log(2 * np.pi), -0.5 * slope
 
@@ -185,8 +186,8 @@ class CorrelatedEvidence:
         weighted = columns.T / variance
         inner = weighted @ columns + np.diag(1.0 / np.square(prior_sd))
         shared = weighted @ pattern
-        left = (pattern * pattern / variance).sum() - shared @ np.linalg.solve(inner, shared)
-        return max(float(left), 0.0)
+        information = (pattern * pattern / variance).sum() - shared @ np.linalg.solve(inner, shared)
+        return max(float(information), 0.0)
 
 
 def _split_by_position(rows: np.ndarray, position_m: np.ndarray) -> list[np.ndarray]:

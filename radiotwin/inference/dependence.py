@@ -31,7 +31,7 @@ class Series:
 def levels_of(values: np.ndarray) -> np.ndarray | None:
     """Bin a variable (n,): integer labels as they are, others by quantiles, NaN in one more bin.
 
-    None if there are too few bins, too many labels, or most values are NaN.
+    None with a single bin, more than n / 5 labels, or more than half of the values NaN.
     """
     if values.dtype.kind in "iu":
         level = np.unique(values, return_inverse=True)[1]

@@ -30,7 +30,7 @@ def robust_sd(values: np.ndarray) -> float:
 
 
 def limits_of(limit_db: Limit, n: int) -> np.ndarray:
-    """Broadcast a limit of detection to n links [dB]; -inf if unknown."""
+    """Return the limit of detection of n links as a read-only array (n,) [dB]; -inf: unknown."""
     return np.broadcast_to(np.asarray(-np.inf if limit_db is None else limit_db, float), n)
 
 
@@ -73,7 +73,7 @@ def standardised(level_db: np.ndarray, mean_db: np.ndarray, sd_db: np.ndarray,
     """Compute the standardised residual (level - mean) / sd of each link; all are (n,).
 
     A blank with a known limit gets the conditional mean of a residual below the limit,
-    -phi(a) / Phi(a), a = (limit - mean) / sd.
+    -phi(a) / Phi(a), a = (limit - mean) / sd; one without, NaN.
     """
     residual = (level_db - mean_db) / sd_db
     missing = np.isnan(residual)

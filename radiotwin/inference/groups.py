@@ -99,7 +99,6 @@ class LastingErrors:
         self._size = np.bincount(self._part)
         self._parts = np.bincount(self._of_part)
 
-
     def sd(self, values: np.ndarray) -> float:
         """Estimate the sd of the error that the values (r,) of a lasting unit, e.g. a place, share.
 
@@ -181,10 +180,11 @@ def log_scatters(values: np.ndarray, groups: Groups, lasting_sd: float | None,
     """
     x, group, count = values[groups.row], groups.group, groups.count
     middle = medians(x, group, count)
-    size = np.minimum(np.abs(x - middle[group]) / scale, MAX_SCALES)
+    deviation = np.minimum(np.abs(x - middle[group]) / scale, MAX_SCALES)
     number = np.maximum(np.bincount(group, minlength=count), 1)
-    mean = np.maximum(np.bincount(group, size, count) / number, 1e-3)
-    return _with_error(np.log(mean), 1 / (number * mean), size - mean[group], groups, lasting_sd)
+    mean = np.maximum(np.bincount(group, deviation, count) / number, 1e-3)
+    return _with_error(np.log(mean), 1 / (number * mean), deviation - mean[group], groups,
+                       lasting_sd)
 
 
 def means(values: np.ndarray, groups: Groups, lasting_sd: float) -> Statistic:
@@ -276,15 +276,16 @@ class PeerComparison:
 def compare_with_peers(found: Statistic, prior_spread: float, dof: float) -> PeerComparison:
     """Measure how far each group is from the median of its peers, which are all other groups.
 
-    The robust spread of the peers is shrunk to `prior_spread`; `dof` are those of the Student t
-    between peers. NaN for a group without a value.
+    With more than LEAVE_OUT groups, a group is one of its own peers. Their robust spread is shrunk
+    to `prior_spread`; `dof` are those of the Student t between peers. NaN for a group without a
+    value, or without peers.
     """
     value, error = found.value, found.error
-    size, total = np.full(len(value), np.nan), np.full(len(value), np.nan)
-    spread, tails = total.copy(), total.copy()
+    deviation, total_error = np.full(len(value), np.nan), np.full(len(value), np.nan)
+    spread, tails = total_error.copy(), total_error.copy()
     judged = np.flatnonzero(np.isfinite(value))
     if len(judged) < 2:
-        return PeerComparison(size, total, spread, tails)
+        return PeerComparison(deviation, total_error, spread, tails)
     values, squares = value[judged], error[judged] ** 2
     if len(judged) <= LEAVE_OUT:
         others = ~np.eye(len(judged), dtype=bool)
@@ -295,20 +296,20 @@ def compare_with_peers(found: Statistic, prior_spread: float, dof: float) -> Pee
     peers = peer_values.shape[1]
     centre = np.median(peer_values, axis=1)
     noise = np.maximum(np.median(peer_squares, axis=1), TINY)
-    seen = (MAD_SD * np.median(np.abs(peer_values - centre[:, None]), axis=1)) ** 2
+    sampled = (MAD_SD * np.median(np.abs(peer_values - centre[:, None]), axis=1)) ** 2
     # Errors are upper bounds: peers may scatter by less than their errors.
     weight = peers - 1.0
-    usual = (weight * seen + PEER_WEIGHT * (prior_spread**2 + noise)) / (weight + PEER_WEIGHT)
-    size[judged] = values - centre
-    total[judged] = np.sqrt(squares * np.minimum(usual / noise, 1.0)
-                            + MEDIAN_VARIANCE / peers * usual)
-    spread[judged] = np.sqrt(np.maximum(usual - noise, 0.0))
+    variance = (weight * sampled + PEER_WEIGHT * (prior_spread**2 + noise)) / (weight + PEER_WEIGHT)
+    deviation[judged] = values - centre
+    total_error[judged] = np.sqrt(squares * np.minimum(variance / noise, 1.0)
+                                  + MEDIAN_VARIANCE / peers * variance)
+    spread[judged] = np.sqrt(np.maximum(variance - noise, 0.0))
     tails[judged] = 1 / (1 / (weight + PRIOR_DOF) + 1 / dof)  # the spread is not known exactly
-    return PeerComparison(size, total, spread, tails)
+    return PeerComparison(deviation, total_error, spread, tails)
 
 
 def combine_parts(parts: list[PeerComparison]) -> PeerComparison:
-    """Average comparisons of the same groups in several parts of the data, by inverse variance."""
+    """Average comparisons of the same groups over parts of the data, weighted by 1/variance."""
     if len(parts) == 1:
         return parts[0]
     sizes = np.array([each.size for each in parts])
@@ -332,11 +333,11 @@ def combine_parts(parts: list[PeerComparison]) -> PeerComparison:
 
 def median_polish(values: np.ndarray, labels: list[np.ndarray]) -> np.ndarray:
     """Subtract from values (n,) the medians of the groups of each labelling (n,) in turn."""
-    left = values.copy()
+    residual = values.copy()
     for _ in range(POLISH_ROUNDS):
         for label in labels:
-            left = left - medians(left, label, int(label.max(initial=0)) + 1)[label]
-    return left
+            residual = residual - medians(residual, label, int(label.max(initial=0)) + 1)[label]
+    return residual
 
 
 def subtract_end_levels(found: Statistic, ends: tuple[np.ndarray, ...]) -> Statistic:
@@ -348,13 +349,13 @@ def subtract_end_levels(found: Statistic, ends: tuple[np.ndarray, ...]) -> Stati
     judged = np.isfinite(found.value)
     value, error = found.value.copy(), found.error.copy()
     labels = [np.unique(end[judged], return_inverse=True)[1].ravel() for end in ends]
-    left = value[judged] - np.median(value[judged])
+    residual = value[judged] - np.median(value[judged])
     for _ in range(POLISH_ROUNDS):
         for end in labels:
             count = int(end.max()) + 1
-            left = left - medians(np.append(left, np.zeros(count)),
-                                  np.append(end, np.arange(count)), count)[end]
-    value[judged] = left
+            residual = residual - medians(np.append(residual, np.zeros(count)),
+                                          np.append(end, np.arange(count)), count)[end]
+    value[judged] = residual
     error[judged] *= np.sqrt(1 + sum(MEDIAN_VARIANCE / (np.bincount(end)[end] + 1)
                                      for end in labels))
     return Statistic(value, error)
@@ -363,8 +364,8 @@ def subtract_end_levels(found: Statistic, ends: tuple[np.ndarray, ...]) -> Stati
 def subtract_unit_errors(values: np.ndarray, label: np.ndarray, unit: np.ndarray) -> np.ndarray:
     """Subtract from values (n,) the error that all groups (n,) share in a unit (n,), e.g. a place.
 
-    Two-way fit by medians, levels of groups plus errors of units; the error of a unit is shrunk to
-    0, fully if only one group was in it.
+    Two-way fit by medians, levels of groups plus errors of units; the error of a unit is shrunk
+    towards 0, and is 0 if only one group was in it.
     """
     cell_of, of_group = _pairs(label, unit)
     size = np.int64(unit.max(initial=0) + 1)

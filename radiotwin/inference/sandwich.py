@@ -83,13 +83,13 @@ class Scores:
             return count / (count - 1) * bread @ (sums.T @ sums) @ bread
         information = information + np.diag(self.precision + 1e-12)
         rows = np.tile(cluster, self.root.shape[0] // len(cluster))
-        moves = np.empty_like(sums)
+        changes = np.empty_like(sums)
         for number in range(count):
             root = self.root[np.flatnonzero(rows == number)]
             bread_without = np.linalg.inv(information - _dense(root.T @ root))
             determined = np.diag(bread_without) <= MAX_WIDTH**2 * np.diag(bread)
-            moves[number] = np.where(determined, bread_without @ sums[number], 0.0)
-        return (count - 1) / count * moves.T @ moves
+            changes[number] = np.where(determined, bread_without @ sums[number], 0.0)
+        return (count - 1) / count * changes.T @ changes
 
     def _effective_clusters(self, bread: np.ndarray, cluster: np.ndarray, count: int) -> np.ndarray:
         """Compute the effective number of clusters (q,): (Σ s)² / Σ s² of squared influences s."""

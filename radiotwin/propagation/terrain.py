@@ -66,10 +66,10 @@ def terrain_paths(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray,
         way_m = receiver_m[rows] - device_m
         free = (speed_of_light / (4 * np.pi * frequency_hz * np.linalg.norm(way_m, axis=1))) ** 2
         found.gain[rows] = free * 10 ** (-delta_bullington_db(profiles, frequency_hz) / 10)
-        beyond, cross_m, height_m = _edges(profiles, profiles.surface_m, profiles.end_m)
-        share = (cross_m / profiles.length_m[beyond])[:, None]
-        found.edge_m[rows[beyond]] = np.column_stack([
-            device_m[:2] + share * way_m[beyond, :2], height_m])
+        blocked, cross_m, height_m = _edges(profiles, profiles.surface_m, profiles.end_m)
+        fraction = (cross_m / profiles.length_m[blocked])[:, None]
+        found.edge_m[rows[blocked]] = np.column_stack([
+            device_m[:2] + fraction * way_m[blocked, :2], height_m])
     return found
 
 
@@ -123,9 +123,9 @@ def _edges(profiles: Profiles, height_m: np.ndarray,
     up, down = (((curved_m - antenna_m[:, None]) / way_m).max(axis=1)
                 for antenna_m, way_m in zip(end_m.T, (at_m, back_m)))
     rise_m = end_m[:, 1] - end_m[:, 0]
-    beyond = up >= rise_m / profiles.length_m
-    cross_m = (rise_m + down * profiles.length_m)[beyond] / (up + down)[beyond]
-    return beyond, cross_m, end_m[beyond, 0] + up[beyond] * cross_m
+    blocked = up >= rise_m / profiles.length_m
+    cross_m = (rise_m + down * profiles.length_m)[blocked] / (up + down)[blocked]
+    return blocked, cross_m, end_m[blocked, 0] + up[blocked] * cross_m
 
 
 def _bullington_db(profiles: Profiles, height_m: np.ndarray, end_m: np.ndarray,
@@ -143,8 +143,8 @@ def _bullington_db(profiles: Profiles, height_m: np.ndarray, end_m: np.ndarray,
     # With line of sight, the edge is the most obstructed point; else where the horizons cross.
     bulge_m = profiles.at_m * (length_m - profiles.at_m) / (2 * EARTH_RADIUS_M)
     nu = parameter(np.ones(len(end_m), bool), profiles.at_m, height_m + bulge_m).max(axis=1)
-    beyond, cross_m, top_m = _edges(profiles, height_m, end_m)
-    nu[beyond] = parameter(beyond, cross_m[:, None], top_m[:, None])[:, 0]
+    blocked, cross_m, top_m = _edges(profiles, height_m, end_m)
+    nu[blocked] = parameter(blocked, cross_m[:, None], top_m[:, None])[:, 0]
     edge_db = knife_edge_db(nu)
     return edge_db + (1 - np.exp(-edge_db / 6)) * (10 + 0.02 * profiles.length_m / 1e3)
 

@@ -155,10 +155,10 @@ class _Urban3gpp(PublishedLaw):
     def validity(self, links: LinkGeometry) -> Validity:
         """Return the ranges of TR 36.777 for aerial receivers, of TR 38.901 for other links."""
         aerial = self._is_aerial(links)
-        hidden = aerial & ~links.los if self.with_map else np.zeros(len(links), dtype=bool)
+        aerial_nlos = aerial & ~links.los if self.with_map else np.zeros(len(links), dtype=bool)
         return Validity(
             self.frequency_range_hz, (10.0, np.where(aerial, MAX_AERIAL_M, MAX_DISTANCE_M)),
-            (MIN_TERMINAL_M, np.where(hidden, self.max_nlos_m, MAX_HEIGHT_M)),
+            (MIN_TERMINAL_M, np.where(aerial_nlos, self.max_nlos_m, MAX_HEIGHT_M)),
             (MIN_TERMINAL_M, np.where(aerial, max(self.station_m, AERIAL_M), AERIAL_M)))
 
     def terrestrial_los_db(self, links: LinkGeometry) -> np.ndarray:
@@ -206,24 +206,24 @@ class UrbanMacro(_Urban3gpp):
         if los:
             return Branch(los_db, np.where(aerial, 4.64 * np.exp(-0.0066 * high_m), 4.0))
         height_m = np.minimum(high_m, MAX_NLOS_HEIGHT_M)
-        above_db = (-17.5 + (46 - 7 * np.log10(height_m)) * log_d
-                    + 20 * np.log10(40 * np.pi * self.frequency_hz / 3e9))
-        below_db = 13.54 + 39.08 * log_d + 20 * self._log_ghz() - 0.6 * (low_m - 1.5)
-        return Branch(np.where(aerial, above_db, np.maximum(los_db, below_db)), 6.0)
+        aerial_db = (-17.5 + (46 - 7 * np.log10(height_m)) * log_d
+                     + 20 * np.log10(40 * np.pi * self.frequency_hz / 3e9))
+        terrestrial_db = 13.54 + 39.08 * log_d + 20 * self._log_ghz() - 0.6 * (low_m - 1.5)
+        return Branch(np.where(aerial, aerial_db, np.maximum(los_db, terrestrial_db)), 6.0)
 
     @override
     def los_probability(self, links: LinkGeometry) -> np.ndarray:
         """Return the UMa LoS probability (n,): TR 36.777 if aerial, else TR 38.901."""
         high_m, low_m = self._ends_m(links)
-        flat_m = ground_m(links)
-        height = np.log10(np.maximum(high_m, AERIAL_M))
-        reach_m = np.where(high_m > 100.0, np.inf, np.maximum(460 * height - 700, 18.0))
-        above = _los_probability(flat_m, reach_m, 4300 * height - 3800)
+        horizontal_m = ground_m(links)
+        log_height = np.log10(np.maximum(high_m, AERIAL_M))
+        reach_m = np.where(high_m > 100.0, np.inf, np.maximum(460 * log_height - 700, 18.0))
+        aerial = _los_probability(horizontal_m, reach_m, 4300 * log_height - 3800)
         # TR 38.901, Table 7.4.2-1: a terminal above 13 m sees farther.
-        extra = np.maximum((low_m - 13) / 10, 0.0) ** 1.5
-        far = 1 + extra * 1.25 * (flat_m / 100) ** 3 * np.exp(-flat_m / 150)
-        below = np.minimum(_los_probability(flat_m, 18.0, 63.0) * far, 1.0)
-        return np.where(self._is_aerial(links), above, below)
+        above_13_m = np.maximum((low_m - 13) / 10, 0.0) ** 1.5
+        farther = 1 + above_13_m * 1.25 * (horizontal_m / 100) ** 3 * np.exp(-horizontal_m / 150)
+        terrestrial = np.minimum(_los_probability(horizontal_m, 18.0, 63.0) * farther, 1.0)
+        return np.where(self._is_aerial(links), aerial, terrestrial)
 
 
 class UrbanMicro(_Urban3gpp):
@@ -239,30 +239,30 @@ class UrbanMicro(_Urban3gpp):
         """Return the UMi path loss and shadowing sd [dB] of aerial receivers, or of terminals."""
         high_m, low_m = self._ends_m(links)
         aerial, log_d = self._is_aerial(links), links.log_distance
-        height = np.log10(high_m)
-        above_db = np.maximum(free_space_db(links.distance_m, self.frequency_hz),
-                              30.9 + (22.25 - 0.5 * height) * log_d + 20 * self._log_ghz())
-        los_db = np.where(aerial, above_db, self.terrestrial_los_db(links))
+        log_height = np.log10(high_m)
+        aerial_db = np.maximum(free_space_db(links.distance_m, self.frequency_hz),
+                               30.9 + (22.25 - 0.5 * log_height) * log_d + 20 * self._log_ghz())
+        los_db = np.where(aerial, aerial_db, self.terrestrial_los_db(links))
         if los:
             return Branch(los_db, np.where(aerial, np.maximum(5 * np.exp(-0.01 * high_m), 2.0),
                                            4.0))
-        above_db = 32.4 + (43.2 - 7.6 * height) * log_d + 20 * self._log_ghz()
-        below_db = 22.4 + 35.3 * log_d + 21.3 * self._log_ghz() - 0.3 * (low_m - 1.5)
-        return Branch(np.maximum(los_db, np.where(aerial, above_db, below_db)),
+        aerial_db = 32.4 + (43.2 - 7.6 * log_height) * log_d + 20 * self._log_ghz()
+        terrestrial_db = 22.4 + 35.3 * log_d + 21.3 * self._log_ghz() - 0.3 * (low_m - 1.5)
+        return Branch(np.maximum(los_db, np.where(aerial, aerial_db, terrestrial_db)),
                       np.where(aerial, 8.0, 7.82))
 
     @override
     def los_probability(self, links: LinkGeometry) -> np.ndarray:
         """Return the UMi LoS probability (n,): TR 36.777 if aerial, else TR 38.901."""
-        high_m, flat_m = self._ends_m(links)[0], ground_m(links)
-        height = np.log10(np.maximum(high_m, AERIAL_M))
-        above = _los_probability(flat_m, np.maximum(294.05 * height - 432.94, 18.0),
-                                 233.98 * height - 0.95)
-        return np.where(self._is_aerial(links), above, _los_probability(flat_m, 18.0, 36.0))
+        high_m, horizontal_m = self._ends_m(links)[0], ground_m(links)
+        log_height = np.log10(np.maximum(high_m, AERIAL_M))
+        aerial = _los_probability(horizontal_m, np.maximum(294.05 * log_height - 432.94, 18.0),
+                                  233.98 * log_height - 0.95)
+        return np.where(self._is_aerial(links), aerial, _los_probability(horizontal_m, 18.0, 36.0))
 
 
-def _los_probability(flat_m: np.ndarray, sure_m: np.ndarray | float,
+def _los_probability(horizontal_m: np.ndarray, sure_m: np.ndarray | float,
                      length_m: np.ndarray | float) -> np.ndarray:
     """Return the LoS probability (n,), 1 up to `sure_m`, then falling (TR 38.901, 7.4.2)."""
-    share = np.minimum(np.divide(sure_m, np.maximum(flat_m, 1e-9)), 1.0)
-    return share + np.exp(-flat_m / length_m) * (1 - share)
+    sure_share = np.minimum(np.divide(sure_m, np.maximum(horizontal_m, 1e-9)), 1.0)
+    return sure_share + np.exp(-horizontal_m / length_m) * (1 - sure_share)

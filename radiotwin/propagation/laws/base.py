@@ -61,14 +61,7 @@ class ChannelModel(ABC):
 
     @abstractmethod
     def predict(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
-        """Predict mean and standard deviation of levels, ignoring the limit of detection.
-
-        Args:
-            links: n links.
-
-        Returns:
-            (n,) mean level [dB], and (n,) standard deviation [dB].
-        """
+        """Predict mean and standard deviation of levels (n,) [dB], as without a detection limit."""
 
     @property
     def trend(self) -> ChannelModel:
@@ -86,15 +79,13 @@ class ChannelModel(ABC):
     def level_at(self, links: Links, exact: bool = False) -> np.ndarray:
         """Return the mean level (n,) [dB] of links, including declared antennas and powers.
 
-        Args:
-            links: n links.
-            exact: True: by this model; False: by its faster approximation `quick`.
+        `exact`: by this model; False: by its faster approximation `quick`.
         """
         channel = self if exact else self.quick
         return channel.predict(links.geometry)[0] + channel.declared_db(links)
 
     def declared_db(self, links: Links) -> np.ndarray | float:
-        """Return what declared powers, cables and antennas add to the levels (n,) of links [dB].
+        """Return what declared powers, cables and antennas add to levels, (n,) [dB]; 0: nothing.
 
         Antenna gains are those along the straight line; models that follow paths override this.
         """
@@ -104,13 +95,8 @@ class ChannelModel(ABC):
         """Return the regression columns that refit the channel's levels together with effects.
 
         By default, a level and a slope over log-distance: one pair each for LoS and NLoS, or one
-        pair for all links if there is no map or the model does not use it.
-
-        Args:
-            links: n links.
-
-        Returns:
-            (n, p) design matrix, and (p,) prior standard deviations [dB].
+        pair for all links if there is no map or the model does not use it. Returns the design
+        matrix (n, p), and prior standard deviations (p,) [dB].
         """
         slope = np.log10(links.distance_m / 100.0)
         classes = [links.los, ~links.los] if self._by_class(links) else [np.ones(len(links), bool)]

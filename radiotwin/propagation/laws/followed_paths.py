@@ -44,7 +44,7 @@ MIN_STEP_M = 1e-9  # a leg shorter than this along an axis counts as parallel to
 def path_gains(geometry: LinkGeometry, kinds: tuple[str, ...] | None = None) -> np.ndarray:
     """Return the summed power gain (n,) of the paths of links between isotropic antennas, linear.
 
-    `kinds` are fields of `PathPowers`; None: all.
+    `kinds` are fields of `PathPowers`; None: all. BadInput without a map.
     """
     columns = [COMPONENTS.index(kind) for kind in (COMPONENTS if kinds is None else kinds)]
     power = np.zeros(len(geometry))
@@ -80,10 +80,10 @@ def paths_of(geometry: LinkGeometry) -> PathDirections:
 
 
 def declared_antenna_db(links: Links) -> np.ndarray | float:
-    """Return what declared antennas add to the path power of n links (n,) [dB].
+    """Return what declared antennas add to the levels of links (n,) [dB]; the scalar 0 if none are.
 
-    Each path is weighted by the antenna gains in the directions in which it departs and arrives.
-    Without a map or a path, the gains are those along the straight line.
+    Each path's power gain is weighted by the antenna gains in its directions at both ends. A link
+    without a path, or without a map, has the antenna gains along the straight line.
     """
     declared = links.declared
     if not declared.has_antennas:
@@ -129,7 +129,7 @@ class Rays:
     def of(cls, links: Links, of_device: bool, straight: bool = False) -> "Rays":
         """Return the rays of links at their devices, or at their receivers.
 
-        `straight`: one ray a link, along the straight line, as without a map.
+        `straight`: one ray a link, along the straight line, of power 1, as without a map.
         """
         if straight or links.city is None:
             way_m = links.offset_m if of_device else -links.offset_m
@@ -204,7 +204,7 @@ _remembered: OrderedDict[tuple[CityMap, _Position, float], _Followed] = OrderedD
 
 
 def _by_device(geometry: LinkGeometry) -> Iterator[tuple[np.ndarray, _Followed, np.ndarray]]:
-    """Yield rows of a device's links, its cached paths, and the rows of these links there."""
+    """Yield a device's links, its cached paths, and the links' rows in them; BadInput: no map."""
     city = geometry.city
     if city is None:
         raise BadInput("the model paths follows paths over a 3D map, and none is given; "
@@ -236,7 +236,7 @@ def followed_from_m(geometry: LinkGeometry, row: int) -> _Position:
 
 def _follow(city: CityMap, wanted: list[tuple[_Position, np.ndarray]],
             frequency_hz: float) -> list[tuple[_Followed, np.ndarray]]:
-    """Return for each position and its receivers (n, 3) [m] the cached paths, and rows (n,)."""
+    """Return the paths from each position, traced unless cached, and its receivers' rows (n,)."""
     nothing = _Followed(np.zeros(0, dtype=np.int64), np.zeros((0, len(COMPONENTS))),
                         _packed(NO_DIRECTIONS))
     keys = [_keys(ends_m) for _, ends_m in wanted]
@@ -296,13 +296,13 @@ def _new_paths(city: CityMap, asked: list[tuple[_Position, np.ndarray]],
             raise ValueError("wrong shapes, or links that do not ascend")
         return powers, paths
 
-    parts: ResultCache[int, _NewPaths] = ResultCache(
+    cache: ResultCache[int, _NewPaths] = ResultCache(
         "paths", lambda number: (city, *asked[number], frequency_hz), write, read)
     found = {}
     for number, (_, ends_m) in enumerate(asked):
-        earlier = parts.get(number)
-        if earlier is not None and len(earlier[0][0]) == len(ends_m):
-            found[number] = earlier[0]
+        stored = cache.get(number)
+        if stored is not None and len(stored[0][0]) == len(ends_m):
+            found[number] = stored[0]
     new = [number for number in range(len(asked)) if number not in found]
     with progress("following paths", total=len(new)) as advance:
         def timed(number: int) -> tuple[_NewPaths, float]:
@@ -313,7 +313,7 @@ def _new_paths(city: CityMap, asked: list[tuple[_Position, np.ndarray]],
 
         # Threads trace; this one stores, since the record of warnings is shared by all threads.
         for number, (value, seconds) in zip(new, in_threads(timed, new), strict=True):
-            parts.put(number, value, [], seconds)
+            cache.put(number, value, [], seconds)
             found[number] = value
     return [found[number] for number in range(len(asked))]
 
@@ -351,8 +351,8 @@ class Power(NamedTuple):
 
     Attributes:
         direct: (n,) of the direct path.
-        others: (n,) sum over all other paths.
-        others_past: (n,) sum over the other paths that the box does not block.
+        others: (n,) sum over the other paths that `KnownPaths` stores.
+        others_past: (n,) sum over those that the box does not block.
     """
 
     direct: np.ndarray
@@ -361,7 +361,11 @@ class Power(NamedTuple):
 
 
 class KnownPaths:
-    """The stronger paths of n links over a map, each traced on first use, to test against boxes."""
+    """Paths of n links over a map, traced on first use, to test against boxes.
+
+    Paths over two edges, along terrain, or with a power below WEAKEST of the strongest path's are
+    left out.
+    """
 
     def __init__(self, geometry: LinkGeometry, city: CityMap) -> None:
         self._geometry, self._city = geometry, city
@@ -381,7 +385,7 @@ class KnownPaths:
                      np.bincount(link, power_past, n)[rows])
 
     def follow(self, rows: np.ndarray) -> None:
-        """Trace links `rows` (r,) not traced before; store their paths unless they are too weak."""
+        """Trace links `rows` (r,) not traced before, and store all but their weak paths."""
         geometry, parts = self._geometry, [self._paths] if self._paths else []
         rows = rows[~self._is_followed[rows]]
         if not len(rows):
@@ -395,9 +399,9 @@ class KnownPaths:
                                           geometry.frequency_hz)
                 strongest = np.zeros(len(chunk))
                 np.maximum.at(strongest, found.receiver, found.power)
-                kept = found.power > WEAKEST * strongest[found.receiver]
-                parts.append((chunk[found.receiver[kept]], found.power[kept],
-                              found.points_m[kept], found.points[kept]))
+                strong = found.power > WEAKEST * strongest[found.receiver]
+                parts.append((chunk[found.receiver[strong]], found.power[strong],
+                              found.points_m[strong], found.points[strong]))
         self._paths = tuple(np.concatenate(arrays) for arrays in zip(*parts, strict=True))
         followed = geometry.select(rows)
         self._direct[rows] = np.where(followed.los, free_space_gains(followed), 0.0)

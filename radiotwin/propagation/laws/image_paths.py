@@ -58,17 +58,17 @@ def fit_class(level_db: np.ndarray, limits_db: np.ndarray, paths: np.ndarray,
               square_db: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
     """Fit level offset and error scale of LoS, or of NLoS, links by maximum likelihood.
 
-    Levels (n,) [dB], NaN: not detected, are compared with those of `paths` (n,); `square_db` (n,)
-    as in `scale_db`. Starts from the result of an earlier fit, or the median offset. Returns (2,)
-    the offset [dB], and the natural logarithm of the error scale over an exact map [dB].
+    Levels (n,) [dB], NaN: not detected, at least one detected, are compared with the levels `paths`
+    (n,) [dB]; `square_db` (n,) as in `scale_db`. Starts from an earlier result, or the median
+    offset. Returns (2,) offset [dB], and ln of the error scale [dB] over an exact map, in -3..4.
     """
     if start is None:
         seen = np.isfinite(level_db)
         start = np.array([np.median((level_db - paths)[seen]), 0.5])
 
-    def nll(numbers: np.ndarray) -> float:
-        class_scale_db = float(np.exp(np.clip(numbers[1], -3, 4)))
-        law = ReadingLaw(paths + numbers[0], scale_db(class_scale_db, square_db), limits_db, DOF)
+    def nll(parameters: np.ndarray) -> float:
+        class_scale_db = float(np.exp(np.clip(parameters[1], -3, 4)))
+        law = ReadingLaw(paths + parameters[0], scale_db(class_scale_db, square_db), limits_db, DOF)
         return float(law.nll(level_db).sum())
 
     found = minimize(nll, start, method="Nelder-Mead", options={"xatol": 0.02, "fatol": 0.02})
@@ -147,7 +147,8 @@ class ImagePaths(ChannelModel):
                     antenna_db: np.ndarray | float = 0.0) -> Self:
         """Fit gain and exponent of the diffuse power to the NLoS links; a level offset is free.
 
-        Arguments are those of `fit`; `antenna_db` (n,) is added to the power of the paths [dB].
+        DIFFUSE_DEFAULT if fewer than MIN_NLOS of them have a level or limit, or none is detected.
+        Arguments as in `fit`; `antenna_db` (n,) is added to the power of the paths [dB].
         """
         nlos = links.select(~links.los)
         level_db = level_db[~links.los]
@@ -163,13 +164,13 @@ class ImagePaths(ChannelModel):
         power = power * 10 ** (np.broadcast_to(antenna_db, len(links))[~links.los] / 10)
         near_m = min(float(np.quantile(links.distance_m, NEAR_QUANTILE)), 100.0)
 
-        def loss(numbers: np.ndarray) -> float:
-            clipped = _clip_diffuse(numbers, near_m, links.frequency_hz)
+        def loss(parameters: np.ndarray) -> float:
+            clipped = _clip_diffuse(parameters, near_m, links.frequency_hz)
             error_db = level_db - _with_diffuse_db(power, nlos.distance_m, *clipped)
             error_db = error_db - np.median(error_db[known & ~blank])
             error_db = np.where(blank, np.minimum(error_db, 0.0), error_db)[known]
             misfit = np.log1p((error_db / ERROR_SCALE_DB) ** 2).sum()
-            return float(misfit + np.abs(numbers - clipped).sum())
+            return float(misfit + np.abs(parameters - clipped).sum())
 
         starts = [np.array([start_db, DIFFUSE_DEFAULT[1]]) for start_db in DIFFUSE_STARTS_DB]
         found = minimize(loss, min(starts, key=loss), method="Nelder-Mead",
@@ -188,7 +189,7 @@ class ImagePaths(ChannelModel):
 
     @override
     def declared_db(self, links: Links) -> np.ndarray | float:
-        """Return what declared powers, cables and antennas add to the levels (n,) of links [dB].
+        """Return what declared powers, cables and antennas add to levels, (n,) [dB]; 0: nothing.
 
         Antenna gains are those along each path; for diffuse power their mean, 0 dBi.
         """
@@ -249,13 +250,13 @@ def stored_diffuse(value: Any) -> tuple[float, float]:
     return require_number(named, "gain", -300.0, 100.0), require_number(named, "exponent", 0, 20)
 
 
-def _clip_diffuse(numbers: np.ndarray, near_m: float, frequency_hz: float) -> np.ndarray:
+def _clip_diffuse(parameters: np.ndarray, near_m: float, frequency_hz: float) -> np.ndarray:
     """Clip gain at 100 m [dB] and exponent (2,) of diffuse power to DIFFUSE_BOUNDS.
 
     Diffuse power must also stay MIN_LOSS_DB below free space beyond `near_m`. Otherwise it would
     replace the traced paths, also of LoS links, since the NLoS level is fitted together with it.
     """
-    gain_db, exponent = np.clip(numbers, *DIFFUSE_BOUNDS)
+    gain_db, exponent = np.clip(parameters, *DIFFUSE_BOUNDS)
     max_gain_db = -free_space_db(np.array(100.0), frequency_hz) - MIN_LOSS_DB \
         + 10 * (exponent - 2.0) * np.log10(near_m / 100.0)
     return np.array([np.clip(gain_db, None, max_gain_db), exponent])
@@ -285,8 +286,8 @@ def fit_offsets(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
                 diffuse: tuple[float, float]) -> Offsets:
     """Estimate how much stronger reflected and diffracted paths are than computed [dB].
 
-    Maximum a posteriori under a normal prior of `OFFSET_SD_DB`. The prior keeps both at 0 if the
-    levels of LoS and NLoS, which are fitted too, explain the data as well.
+    Maximum a posteriori under a normal prior of `OFFSET_SD_DB`, within ±`MAX_OFFSET_DB`. The levels
+    of LoS and NLoS links are fitted as well.
     """
     fit, gains = LinkFit(level_db, limit_db), interaction_gains(links)
     distance_m = links.distance_m

@@ -97,8 +97,9 @@ class ResidualField:
             kind: np.ndarray | None = None) -> Self:
         """Fit the correlation over distance, store the points, and return the field itself.
 
-        Residuals (n,) have unit variance; `series` (n,) and `kind` (n,), such as the phone (None:
-        all the same), are indices. `seed` draws the points to which the correlation is fitted.
+        Residuals (n,), of unit variance, are at positions (n, 3) [m]; `series` (n,) is the index of
+        the field of each, `kind` (n,) that of, e.g., the phone (None: all the same). `seed` draws
+        the points to which the correlation is fitted.
         """
         rng = np.random.default_rng(seed)
         kind = np.zeros(len(series), dtype=int) if kind is None else kind
@@ -142,16 +143,15 @@ class ResidualField:
             self.fields[number] = field
         return rows_of_series
 
-    def _max_points(self, series: int) -> int:
+    def _max_points(self, series_count: int) -> int:
         """Return the largest number of points of a series, given the number of series."""
-        return int(np.clip(np.sqrt(self.max_pairs / max(series, 1)), MIN_POINTS, MAX_POINTS))
+        return int(np.clip(np.sqrt(self.max_pairs / max(series_count, 1)), MIN_POINTS, MAX_POINTS))
 
     def predict(self, series: np.ndarray, position_m: np.ndarray,
                 kind: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Return posterior mean and standard deviation (n,) of the residual; arguments as in `fit`.
+        """Return posterior mean and standard deviation (n,) of residuals of unit variance.
 
-        Far from stored points, and in unknown series, they are 0 and 1. Memory does not grow
-        with n.
+        They are 0 and 1 far from stored points, and in unknown series; arguments as in `fit`.
         """
         mean, sd = np.zeros(len(series)), np.ones(len(series))
         for (factor, weights), rows, cross in self._batches(series, position_m, kind):
@@ -256,8 +256,11 @@ class ResidualField:
         covariance.ravel()[::len(covariance) + 1] += nugget + 1e-8  # keeps it positive definite
         return covariance
 
-    def _fit_correlation(self, fields: list[_Field], kinds: bool) -> None:
-        """Fit shares and length by marginal likelihood (Rasmussen and Williams 2006, eq. 5.8)."""
+    def _fit_correlation(self, fields: list[_Field], has_kinds: bool) -> None:
+        """Fit shares and length by marginal likelihood (Rasmussen and Williams 2006, eq. 5.8).
+
+        They stay as they are if no series has points at two places.
+        """
         distances_m = [cdist(field.position_m, field.position_m) for field in fields]
         max_m = max(float(distance_m.max()) for distance_m in distances_m)
         if max_m == 0.0:
@@ -265,7 +268,7 @@ class ResidualField:
 
         def assign(theta: np.ndarray) -> None:
             """Set share, length and kind_share from log(a/nugget), log(length), log(b/nugget)."""
-            position, kind = np.exp(theta[0]), np.exp(theta[2]) if kinds else 0.0
+            position, kind = np.exp(theta[0]), np.exp(theta[2]) if has_kinds else 0.0
             total = 1.0 + position + kind
             self.share, self.kind_share = float(position / total), float(kind / total)
             self.length_m = float(np.exp(theta[1]))
@@ -281,12 +284,12 @@ class ResidualField:
                 value += 0.5 * whitened @ whitened + np.log(np.diag(factor)).sum()
             return value
 
-        number = 2 + kinds
-        bounds = [(-4.0, 6.0), (np.log(1.0), np.log(max(2.0, 2.0 * max_m))), (-6.0, 4.0)][:number]
-        starts = [np.array([0.0, np.log(part * max_m), -1.0])[:number] for part in (0.02, 0.2)]
+        count = 2 + has_kinds
+        bounds = [(-4.0, 6.0), (np.log(1.0), np.log(max(2.0, 2.0 * max_m))), (-6.0, 4.0)][:count]
+        starts = [np.array([0.0, np.log(part * max_m), -1.0])[:count] for part in (0.02, 0.2)]
         start = min((np.clip(start, *np.transpose(bounds)) for start in starts), key=objective)
-        simplex = np.vstack([start, start + np.diag([1.0, 0.7, 1.0])[:number, :number]])
-        options = {"initial_simplex": simplex, "maxfev": 30 * number, "xatol": 0.05, "fatol": 0.1}
+        simplex = np.vstack([start, start + np.diag([1.0, 0.7, 1.0])[:count, :count]])
+        options = {"initial_simplex": simplex, "maxfev": 30 * count, "xatol": 0.05, "fatol": 0.1}
         assign(minimize(objective, start, method="Nelder-Mead", bounds=bounds, options=options).x)
 
     def _has_too_many(self, number: int) -> bool:
@@ -345,7 +348,8 @@ def _random_points(field: _Field, rng: np.random.Generator) -> _Field:
 def _fixed_receivers_m(links: LinkGeometry) -> np.ndarray:
     """Return positions (k, 3) of fixed receivers [m] if devices move; (0, 3) if receivers move.
 
-    Devices move if the median link's receiver heard more devices than places heard its device.
+    Devices move if, in the median, a link's receiver has links to more devices than its device to
+    receiver positions. Receivers with links to fewer than MIN_POINTS devices are left out.
     """
     cells, place = np.unique(np.round(links.receiver_m / SAME_PLACE_M), axis=0,
                              return_inverse=True)

@@ -95,15 +95,15 @@ def _estimate_sizes(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
 
     last_traced = [1, 1]  # index of the largest traced size of walls, of heights
     while True:
-        nll, z = np.full([STEPS * last + 1 for last in last_traced], np.inf), level_db
+        nll, residual = np.full([STEPS * last + 1 for last in last_traced], np.inf), level_db
         for wall, height in np.ndindex(*nll.shape):
             wall_db2 = interpolated([(size, 0.0) for size in WALL_SIZES_M], wall / STEPS)
             height_db2 = interpolated([(0.0, size) for size in HEIGHT_SIZES_M], height / STEPS)
-            link_nll, link_z = fit.fit(links.los, base_db, wall_db2 + height_db2)
+            link_nll, link_residual = fit.fit(links.los, base_db, wall_db2 + height_db2)
             if link_nll.sum() < nll.min():
-                z = link_z
+                residual = link_residual
             nll[wall, height] = link_nll.sum()
-        variance_factor = design_effect(ground_blocks(links), z)
+        variance_factor = design_effect(ground_blocks(links), residual)
         drop = INTERVAL_NATS * variance_factor
         likely = [np.flatnonzero(nll.min(axis=1 - axis) - nll.min() <= drop) for axis in range(2)]
         # Trace paths over maps with larger errors only if these may be likely.
@@ -123,7 +123,7 @@ def _mean_square_db(links: LinkGeometry, base_db: np.ndarray,
     """Return the mean square level change (n,) [dB²] from a map to random wrong copies of it.
 
     `base_db` (n,) are the levels over the given map, `power` the arguments of `paths_db`, `size_m`
-    the standard deviations of walls and of heights in the copies.
+    the standard deviations of walls and of heights in the copies. Zeros without a map.
     """
     city = links.city
     if city is None or not any(size_m):
@@ -138,7 +138,7 @@ def _mean_square_db(links: LinkGeometry, base_db: np.ndarray,
 
 
 def _size(best: np.intp, likely: np.ndarray, scale_m: tuple[float, ...]) -> Size:
-    """Convert best and `likely` steps on a scale of sizes to an estimate and 90 % interval [m]."""
+    """Convert best and `likely` steps to an estimate and 90 % interval [m], widened by a step."""
     steps = np.array([best, likely[0] - 1, likely[-1] + 1]) / STEPS
     size_m, low_m, high_m = np.interp(steps, np.arange(len(scale_m)), scale_m).tolist()
     return size_m, low_m, high_m
@@ -148,10 +148,10 @@ def estimate_shift(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit, s
                    ) -> Shift:
     """Estimate the shift of a map from links between declared positions (maximum likelihood).
 
-    Returns shift east and north and 90 % radius [m]; zeros if there are too few links, or it is not
-    significant. Wrong walls look like a different shift around each device. So the shift found
-    without a device must raise that device's likelihood, tested over all devices, and explain more
-    than errors of walls do.
+    Returns shift east and north and 90 % radius [m]; zeros with fewer than MIN_LINKS links or
+    MIN_DEVICES devices, below SEEN_SHIFT_M, or if not significant: wrong walls look like a
+    different shift around each device, so the shift found without a device must raise that device's
+    likelihood, tested over all devices, and explain more than errors of walls do.
     """
     limits_db = limits_of(limit_db, len(links))
     known = np.isfinite(level_db) | np.isfinite(limits_db)
@@ -199,7 +199,7 @@ def _random_rows(known: np.ndarray, count: int, seed: int) -> np.ndarray:
 
 def _try_shifts(links: LinkGeometry, fit: LinkFit, diffuse: tuple[float, float]
                 ) -> dict[tuple[float, float], np.ndarray]:
-    """Try shifts [m] on rings, then descend from the best; return the links' (n,) nll by shift."""
+    """Try shifts up to MAX_SHIFT_M on rings, then descend; return the links' (n,) nll by shift."""
     tried: dict[tuple[float, float], np.ndarray] = {}
 
     def try_shift(east_m: float, north_m: float) -> None:
@@ -307,10 +307,11 @@ Found = tuple[MapError, tuple[float, float]]
 
 def estimate_map_error(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
                        seed: int) -> Found:
-    """Estimate the errors of a map from links to devices of known positions, by maximum likelihood.
+    """Estimate the errors of a map from measured links, by maximum likelihood.
 
     Levels are (n,) [dB], NaN: not detected; `seed` is of the random links and maps. Returns the
-    errors, zeros if there are too few links, and the diffuse power.
+    errors, zeros with fewer than MIN_LINKS links, and the diffuse power. Only for the shift, links
+    to devices of estimated positions are left out.
     """
     shift_m = estimate_shift(links, level_db, limit_db, seed)
     links = MapError(shift_m=shift_m).on_map(links)

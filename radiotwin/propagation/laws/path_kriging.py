@@ -64,12 +64,7 @@ class PathKriging(ChannelModel):
     follows_paths = True
 
     def __init__(self, found: Found | None = None, lost: tuple[int, ...] = ()) -> None:
-        """Make a model to be fitted.
-
-        Args:
-            found: map errors and diffuse power from `estimate_map_error`; None: `fit` estimates.
-            lost: devices that are predicted by kriging only, see the class.
-        """
+        """Make a model; `found` is the result of `estimate_map_error`, None: `fit` estimates it."""
         self._found, self.lost = found, np.array(lost, dtype=np.int64)
         self.map_error, self.diffuse = found or (MapError(), DIFFUSE_DEFAULT)
         self.classes = np.array([[0.0, 5.0], [0.0, 5.0]])
@@ -84,12 +79,12 @@ class PathKriging(ChannelModel):
         """Fit traced paths and kriging (map errors, too, unless given), and the weights of both."""
         links, level_db, limit_db = drop_uninformative(links, level_db, limit_db)
         self.seed = seed
-        sure = ~np.isin(links.device, self.lost)
+        traced = ~np.isin(links.device, self.lost)
         self.map_error, self.diffuse = self._found or estimate_map_error(
-            links.select(sure), level_db[sure], limit_db[sure], seed)
+            links.select(traced), level_db[traced], limit_db[traced], seed)
         links = self.map_error.on_map(links)
         self.kriging.fit(links, level_db, limit_db, seed)
-        links, level_db, limit_db = links.select(sure), level_db[sure], limit_db[sure]
+        links, level_db, limit_db = links.select(traced), level_db[traced], limit_db[traced]
         paths = self._over_maps(links)
         self._fit_classes(links, level_db, limit_db, *paths)
         residual = standardised(level_db, *self._calibrated(links, *paths), limit_db)
@@ -102,18 +97,18 @@ class PathKriging(ChannelModel):
         """Predict by the mixture of traced paths and kriging; `lost` devices by kriging alone."""
         links = self.map_error.on_map(links)
         mean_db, sd_db = self.kriging.predict(links)
-        sure = np.flatnonzero(~np.isin(links.device, self.lost))
-        followed = links.select(sure)
-        path_db, path_sd_db = self._calibrated(followed, *self._over_maps(followed))
-        residual, residual_sd = self.field.predict(followed.device, followed.receiver_m)
+        rows = np.flatnonzero(~np.isin(links.device, self.lost))
+        traced_links = links.select(rows)
+        path_db, path_sd_db = self._calibrated(traced_links, *self._over_maps(traced_links))
+        residual, residual_sd = self.field.predict(traced_links.device, traced_links.receiver_m)
         by_paths = path_db + path_sd_db * residual, path_sd_db * residual_sd
-        weight = self.weight[followed.los.astype(int)]
-        mean_db[sure], sd_db[sure] = _mixture(weight, by_paths, (mean_db[sure], sd_db[sure]))
+        weight = self.weight[traced_links.los.astype(int)]
+        mean_db[rows], sd_db[rows] = _mixture(weight, by_paths, (mean_db[rows], sd_db[rows]))
         return mean_db, sd_db
 
     @override
     def declared_db(self, links: Links) -> np.ndarray | float:
-        """Return declared powers, cables and antenna gains (n,) [dB], the gains along each path."""
+        """Return declared power, cable and antenna gain along each path, (n,) [dB]; 0: none."""
         if not links.declared.has_antennas:
             return links.declared_db
         return links.declared.fed_db[links.device] + declared_antenna_db(links)
@@ -129,10 +124,9 @@ class PathKriging(ChannelModel):
         return self.kriging.law
 
     def _over_maps(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean (n,) [dB] and variance (n,) [dB²] of path levels over maps that may be true.
+        """Return mean (n,) [dB] and variance (n,) [dB²] of path levels over the possible maps.
 
-        These are the given map and, if it has errors, copies with random ones of the estimated
-        sizes.
+        These are the given map and, if it has errors, copies with random ones of these sizes.
         """
         power = self.diffuse, self.map_error.offsets_db
         levels_db = [paths_db(links, *power)]
@@ -146,36 +140,41 @@ class PathKriging(ChannelModel):
         return np.mean(levels_db, axis=0), unbiased * np.var(levels_db, axis=0)
 
     def _fit_classes(self, links: LinkGeometry, level_db: np.ndarray, limit_db: np.ndarray,
-                     mean_db: np.ndarray, square_db: np.ndarray) -> None:
-        """Fit `classes`; if LoS or NLoS has no detected link, it takes the numbers of the other."""
+                     mean_db: np.ndarray, variance_db2: np.ndarray) -> None:
+        """Fit the level offset and error scale of LoS and of NLoS links, `classes`.
+
+        Levels (n,) [dB], NaN: not detected; mean and variance (n,) as from `_over_maps`. A class
+        without a detected link gets the parameters of the other class.
+        """
         detected = [bool(np.isfinite(level_db[links.los == los]).any()) for los in (False, True)]
         for los in (0, 1):
             if detected[los]:
                 of_class = links.los == los
                 offset_db, log_scale = fit_class(level_db[of_class], limit_db[of_class],
-                                                 mean_db[of_class], square_db[of_class])
+                                                 mean_db[of_class], variance_db2[of_class])
                 self.classes[los] = offset_db, np.exp(log_scale)
         if detected[0] != detected[1]:
             self.classes[:] = self.classes[detected.index(True)]
 
-    def _calibrated(self, links: LinkGeometry, mean_db: np.ndarray, square_db: np.ndarray
+    def _calibrated(self, links: LinkGeometry, mean_db: np.ndarray, variance_db2: np.ndarray
                     ) -> tuple[np.ndarray, np.ndarray]:
         """Return mean and sd (n,) [dB] of levels from `_over_maps` after the fit of `classes`."""
         offset_db, class_scale_db = self.classes[links.los.astype(int)].T
-        return mean_db + offset_db, SPREAD_FACTOR * scale_db(class_scale_db, square_db)
+        return mean_db + offset_db, SPREAD_FACTOR * scale_db(class_scale_db, variance_db2)
 
     def _held_out_weight(self, links: LinkGeometry, level_db: np.ndarray, limit_db: np.ndarray,
-                         mean_db: np.ndarray, square_db: np.ndarray) -> np.ndarray:
+                         mean_db: np.ndarray, variance_db2: np.ndarray) -> np.ndarray:
         """Return the weights (2,) of traced paths against kriging, in NLoS and LoS, in 0..1.
 
-        They minimise the squared error on detected links in held-out squares of ground.
+        They minimise the squared error on detected links in held-out squares of ground; 1 for a
+        class without such links.
         """
         square = np.floor(links.receiver_m[:, :2] / BLOCK_M)
         label = np.unique(square, axis=0, return_inverse=True)[1].reshape(-1)
         rng = np.random.default_rng(self.seed)
         fold = rng.permutation(np.arange(label.max() + 1) % FOLDS)[label]
         errors_db = np.full((2, len(links)), np.nan)
-        by_paths = *self._calibrated(links, mean_db, square_db), self.field
+        by_paths = *self._calibrated(links, mean_db, variance_db2), self.field
         by_law = *self.kriging.law.predict(links), self.kriging.field
         for row, (trend_db, sd_db, field) in enumerate((by_paths, by_law)):
             residual = standardised(level_db, trend_db, sd_db, limit_db)
@@ -240,6 +239,6 @@ def _mixture(weight: np.ndarray, first: tuple[np.ndarray, np.ndarray],
              second: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Return mean and sd (n,) [dB] of a mixture of normals (mean, sd); `weight` is of `first`."""
     mean_db = weight * first[0] + (1 - weight) * second[0]
-    square_db = weight * (first[1]**2 + (first[0] - mean_db)**2) \
+    variance_db2 = weight * (first[1]**2 + (first[0] - mean_db)**2) \
         + (1 - weight) * (second[1]**2 + (second[0] - mean_db)**2)
-    return mean_db, np.sqrt(square_db)
+    return mean_db, np.sqrt(variance_db2)

@@ -106,7 +106,7 @@ class PublishedLaw(ChannelModel):
     @override
     def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
             seed: int = 0) -> Self:
-        """Take frequency and mean roof height from the links; levels are not used.
+        """Take frequency and, if `needs_map`, mean roof height from the links, nothing from levels.
 
         Raises:
             BadInput: the frequency is unknown or far out of range, or the law needs a map with
@@ -139,22 +139,22 @@ class PublishedLaw(ChannelModel):
         mean of both variances plus the variance between the two medians.
         """
         los, nlos = self.branch(links, True), self.branch(links, False)
-        share = links.los.astype(float) if self.with_map else self.los_probability(links)
-        loss_db = share * los.loss_db + (1 - share) * nlos.loss_db
-        variance = (share * np.square(los.sd_db) + (1 - share) * np.square(nlos.sd_db)
-                    + share * (1 - share) * (los.loss_db - nlos.loss_db) ** 2)
+        los_share = links.los.astype(float) if self.with_map else self.los_probability(links)
+        loss_db = los_share * los.loss_db + (1 - los_share) * nlos.loss_db
+        variance = (los_share * np.square(los.sd_db) + (1 - los_share) * np.square(nlos.sd_db)
+                    + los_share * (1 - los_share) * (los.loss_db - nlos.loss_db) ** 2)
         return self.power_dbm - loss_db, np.sqrt(variance)
 
     def outside(self, links: LinkGeometry) -> list[str]:
         """Return a message for each quantity, such as distance, outside its published range."""
         found = []
         for what, value, least, greatest, unit in self._quantities(links):
-            odd = (value < least) | (value > greatest)
-            if not odd.any():
+            out = (value < least) | (value > greatest)
+            if not out.any():
                 continue
-            ends = dict.fromkeys((shortly(value[odd].min()), shortly(value[odd].max())))
-            share = "" if (value == value[0]).all() and odd.all() else f" in {percent(odd.mean())}"
-            ranges = sorted(set(zip(least[odd].tolist(), greatest[odd].tolist(), strict=True)))
+            ends = dict.fromkeys((shortly(value[out].min()), shortly(value[out].max())))
+            share = "" if (value == value[0]).all() and out.all() else f" in {percent(out.mean())}"
+            ranges = sorted(set(zip(least[out].tolist(), greatest[out].tolist(), strict=True)))
             published = " or ".join(
                 f"{low:g} and more" if np.isinf(high) else f"{low:g} to {high:g}"
                 for low, high in ranges)
@@ -240,8 +240,8 @@ def free_space_db(distance_m: np.ndarray, frequency_hz: float) -> np.ndarray:
 def mean_roof_m(city: CityMap) -> float:
     """Return the mean height of a map's roofs over MIN_ROOF_M above the ground [m]; 0: none."""
     low_m, high_m = city.vertices[:, :2].min(axis=0), city.vertices[:, :2].max(axis=0)
-    share = (np.arange(GRID) + 0.5) / GRID
-    x_m, y_m = (low + share * (high - low) for low, high in zip(low_m, high_m, strict=True))
+    fraction = (np.arange(GRID) + 0.5) / GRID
+    x_m, y_m = (low + fraction * (high - low) for low, high in zip(low_m, high_m, strict=True))
     height_m = city.height_at(*np.meshgrid(x_m, y_m)) - city.ground_height_m(*np.meshgrid(x_m, y_m))
     roofs_m = height_m[height_m > MIN_ROOF_M]
     return float(roofs_m.mean()) if len(roofs_m) else 0.0

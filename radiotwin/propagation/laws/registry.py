@@ -47,18 +47,15 @@ _TRIED_M = np.array([(1.0, 0.0), (30.0, 10.0), (300.0, -50.0), (3e3, 100.0), (1e
 def register(model: type[ChannelModel]) -> type[ChannelModel]:
     """Add a channel model to this process and return its class; usable as a decorator.
 
-    Args:
-        model: subclass of `ChannelModel` with a new name.
-
     Raises:
         BadInput: not a channel model, or another model has its name.
     """
     if not (isinstance(model, type) and issubclass(model, ChannelModel)):
         raise BadInput(f"{model!r} is not a subclass of radiotwin.propagation.laws.ChannelModel")
-    taken = {each.name: each for each in BUILT_IN} | _registered
-    if taken.get(model.name, model) is not model:
+    known = {each.name: each for each in BUILT_IN} | _registered
+    if known.get(model.name, model) is not model:
         raise BadInput(f"the channel model {model.name!r} of {model.__module__} is in "
-                       f"{taken[model.name].__module__} already; give it another name")
+                       f"{known[model.name].__module__} already; give it another name")
     _registered[model.name] = model
     return model
 
@@ -140,7 +137,7 @@ def decode_both(data: bytes, source: object) -> tuple[ChannelModel, dict[str, np
 
 
 def _try_to_predict(model: ChannelModel) -> None:
-    """Raise ValueError if a model predicts non-finite levels at a few links without a map."""
+    """Raise ValueError unless `quick` predicts finite mean and sd ≥ 0 of links without a map."""
     horizontal_m, rise_m = np.tile(_TRIED_M, (2, 1)).T
     count, zero = len(rise_m), np.zeros(len(rise_m))
     links = LinkGeometry(np.zeros((count, 3)), np.column_stack([horizontal_m, zero, rise_m]),

@@ -195,7 +195,7 @@ class SegmentedNN(ChannelModel):
     @override
     def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
             seed: int = 0) -> Self:
-        """Fit the segmented law, train networks on its residuals, and tabulate their mean."""
+        """Fit the law, train networks on its residuals, tabulate their mean; needs torch."""
         require_torch()
         links, level_db, limit_db = drop_uninformative(links, level_db, limit_db)
         self.law.fit(links, level_db, limit_db)

@@ -177,7 +177,8 @@ def _with_facets_after(surfaces: Surfaces, ways: PathsToEdges, first: np.ndarray
     """Combine partial paths to edges with the sequences `after` (m, b) that rays hit behind them.
 
     `first` and `end` (e,) delimit an edge's rows in `after`, the empty sequence first; `parent`
-    (m,) is the row without the last facet. Returns rows (c,) of the ways, and of `after`.
+    (m,) is the row without the last facet. Returns rows (c,) of the ways, and of `after`, of paths
+    of at most `depth` interactions.
     """
     max_rows = total = 0
     for way in range(len(ways.edge)):
@@ -398,7 +399,8 @@ class CandidateSearch:
     def pairs_of_edges(self, edges: np.ndarray) -> EdgePairsToTry:
         """List second edges to try after each of the first edges (s,), for double diffraction.
 
-        A second edge borders a facet that rays from the first edge hit directly.
+        A second edge borders a facet that rays from the first edge hit directly; `candidates` must
+        have been called for a device that sees the first edges.
         """
         with self._lock:
             after, first = self._after, self._first_after[edges]

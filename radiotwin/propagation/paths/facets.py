@@ -93,7 +93,7 @@ def _topology(city: CityMap) -> Topology:
 
 
 def _weld(vertices_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Merge vertices (v, 3) [m] within `WELD_M` into their means, with new rows (v,)."""
+    """Merge vertices (v, 3) [m] within `WELD_M`; return their means, and rows (v,) in these."""
     exact, index = np.unique(vertices_m, axis=0, return_inverse=True)
     pairs = cKDTree(exact).query_pairs(WELD_M, output_type="ndarray")
     graph = coo_matrix((np.ones(len(pairs)), pairs.T.reshape(2, -1)), shape=(len(exact),) * 2)
@@ -225,7 +225,7 @@ def _facets(city: CityMap, topology: Topology) -> tuple[np.ndarray, np.ndarray, 
 
 
 def _coplanar_groups(topology: Topology, material: np.ndarray) -> np.ndarray:
-    """Return the facet (t,) of each triangle: connected, coplanar, and of one material (t,)."""
+    """Return the facet (t,) of each triangle: connected, coplanar, and of one `material` (t,)."""
     size = np.diff(topology.group)
     pairs = [np.empty((0, 2), dtype=int)]
     for i in range(MAX_TRIANGLES_AT_SEGMENT):

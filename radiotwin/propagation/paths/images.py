@@ -103,7 +103,7 @@ def find_paths(surfaces: Surfaces, candidates: Candidates, device_m: np.ndarray,
     """Find paths for all candidates and receivers (n, 3) [m] in order, until the buffer is full.
 
     Begins at `cursor`, candidate · n + receiver, and fills the buffer from its first row on.
-    Returns the number of paths found, and the cursor at which to continue.
+    Returns the number of paths, not yet tested for obstacles, and the cursor to continue at.
     """
     planes, uv_m, edges = surfaces.planes, surfaces.triangle_uv_m, surfaces.edges
     n = len(receiver_m)
@@ -153,12 +153,12 @@ def find_paths(surfaces: Surfaces, candidates: Candidates, device_m: np.ndarray,
                                   receiver_m, spheres, frame, possible)
         along_m, across_m = source_m
         for i in range(count):  # of bounding shapes; check triangles and find the points
-            at = possible[i]
-            if row * n + at < cursor:
+            receiver = possible[i]
+            if row * n + receiver < cursor:
                 continue
             if found == len(buffer.count):
-                return found, row * n + at
-            x, y, z = receiver_m[at, 0], receiver_m[at, 1], receiver_m[at, 2]
+                return found, row * n + receiver
+            x, y, z = receiver_m[receiver, 0], receiver_m[receiver, 1], receiver_m[receiver, 2]
             points_m = buffer.points_m[found]
             interactions = before
             if edge >= 0:
@@ -170,8 +170,8 @@ def find_paths(surfaces: Surfaces, candidates: Candidates, device_m: np.ndarray,
             if not reflections_back(planes, uv_m, facets_before, x, y, z, image, points_m):
                 continue
             points_m[0] = device_m
-            points_m[interactions + 1] = receiver_m[at]
-            buffer.receiver[found], buffer.candidate[found] = at, row
+            points_m[interactions + 1] = receiver_m[receiver]
+            buffer.receiver[found], buffer.candidate[found] = receiver, row
             buffer.count[found] = interactions + 2
             found += 1
     return found, n * len(candidates.edge)

@@ -276,11 +276,11 @@ def _follow(scene: Scene, index: list[int], points_m: np.ndarray, usable: np.nda
 def _links(scene: Scene, index: list[int], points_m: np.ndarray) -> xr.Dataset:
     """Return a dataset of links with device name, device position and receiver position [m]."""
     names = np.array([scene.config.devices[device].device for device in index], dtype=object)
-    ends = {"device": np.repeat(names, len(points_m))}
+    columns = {"device": np.repeat(names, len(points_m))}
     for axis, name in enumerate("xyz"):
-        ends[f"device_{name}_m"] = np.repeat(scene.device_m[index, axis], len(points_m))
-        ends[f"receiver_{name}_m"] = np.tile(points_m[:, axis], len(index))
-    return xr.Dataset({name: ("link", values) for name, values in ends.items()})
+        columns[f"device_{name}_m"] = np.repeat(scene.device_m[index, axis], len(points_m))
+        columns[f"receiver_{name}_m"] = np.tile(points_m[:, axis], len(index))
+    return xr.Dataset({name: ("link", values) for name, values in columns.items()})
 
 
 def _describe(dataset: xr.Dataset, rays: Rays, frequency_hz: float, velocity: np.ndarray | None,
@@ -305,15 +305,15 @@ def _describe(dataset: xr.Dataset, rays: Rays, frequency_hz: float, velocity: np
         "link_of_path": link.astype(np.int32), "path_gain_db": path_gain_db,
         "phase_rad": np.angle(amplitude), "delay_s": delay_s}
     for end in ("departure", "arrival"):
-        way = getattr(rays, end)
-        azimuth = np.arctan2(way[:, 0], way[:, 1])
-        elevation = np.arcsin(np.clip(way[:, 2], -1, 1))
+        ray = getattr(rays, end)
+        azimuth = np.arctan2(ray[:, 0], ray[:, 1])
+        elevation = np.arcsin(np.clip(ray[:, 2], -1, 1))
         of_paths[f"{end}_azimuth_deg"] = np.degrees(azimuth) % 360
         of_paths[f"{end}_elevation_deg"] = np.degrees(elevation)
         values[f"{end}_azimuth_spread_deg"] = angular_spread_deg(azimuth, power, link, links)
         values[f"{end}_zenith_spread_deg"] = angular_spread_deg(elevation, power, link, links)
         if end == "arrival" and velocity is not None:
-            shift_hz = way @ velocity / (speed_of_light / frequency_hz)  # approaching is positive
+            shift_hz = ray @ velocity / (speed_of_light / frequency_hz)  # approaching is positive
             of_paths["doppler_hz"] = shift_hz
             values["doppler_spread_hz"] = rms_spread(shift_hz, power, link, links)
     for name, value in values.items():

@@ -212,12 +212,13 @@ def _strongest_candidates(candidates: Candidates, found: Sequence[tuple[np.ndarr
                           total: np.ndarray, over_seen_edge: np.ndarray) -> Candidates:
     """Select the candidates to try again from positions close by: those of strong paths (p,).
 
-    Also one for each edge that the device sees. `total` (n,) is a link's power.
+    Also one for each edge that the device sees. `found` holds candidate, link and power (p,) of
+    paths, `total` (n,) is a link's power.
     """
     candidate, link, power = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
-    keep = over_seen_edge & (candidates.after[:, :1] < 0).all(axis=1)
-    keep[candidate[power > WEAK_SHARE * total[link]]] = True
-    return Candidates(*(array[keep] for array in candidates))
+    is_chosen = over_seen_edge & (candidates.after[:, :1] < 0).all(axis=1)
+    is_chosen[candidate[power > WEAK_SHARE * total[link]]] = True
+    return Candidates(*(array[is_chosen] for array in candidates))
 
 
 def paths_with_points(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray,
@@ -256,9 +257,9 @@ def _strongest(paths: PathDirections, links: int) -> PathDirections:
     order = np.lexsort((share, paths.link))
     cumulated = np.cumsum(share[order])
     before = np.concatenate([[0.0], cumulated])[np.searchsorted(paths.link, paths.link)]
-    kept = np.zeros(len(share), dtype=bool)
-    kept[order] = cumulated - before > NEGLECTED
-    return PathDirections(*(array[kept] for array in paths))
+    is_strong = np.zeros(len(share), dtype=bool)
+    is_strong[order] = cumulated - before > NEGLECTED
+    return PathDirections(*(array[is_strong] for array in paths))
 
 
 def _direct(city: CityMap, from_m: np.ndarray, to_m: np.ndarray, wave_number: float) -> np.ndarray:

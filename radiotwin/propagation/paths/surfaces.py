@@ -58,7 +58,7 @@ def height(planes: np.ndarray, facet: int, x: float, y: float, z: float) -> floa
 @njit(cache=True, error_model="numpy")
 def within(planes: np.ndarray, triangle_uv_m: np.ndarray, facet: int, x: float, y: float, z: float
            ) -> bool:
-    """Return True if a point in the plane of a facet lies on the facet."""
+    """Return True if a point in the plane of a facet lies on the facet; the ground is endless."""
     if facet == len(planes) - 1:
         return True
     x = x - planes[facet, ORIGIN]
