@@ -54,20 +54,20 @@ def vary_patterns(effect: Effect, end: str) -> Variation:
         end: "devices" or "receivers": the parameter that holds the patterns by index.
     """
     patterns = getattr(effect.params, end)
-    members, fields = len(patterns), quantities(next(iter(patterns.values())))
+    count, fields = len(patterns), quantities(next(iter(patterns.values())))
     values = np.array([[getattr(pattern, name) for name in fields]
                        for pattern in patterns.values()])
-    steps, low, high = (np.tile([field[key] for field in fields.values()], members)
+    steps, low, high = (np.tile([field[key] for field in fields.values()], count)
                         for key in ("step", "low", "high"))
 
     def with_numbers(numbers: np.ndarray) -> Any:
-        rows = np.reshape(numbers, (members, -1)).tolist()
+        rows = np.reshape(numbers, (count, -1)).tolist()
         return effect.changed(**{end: {
             member: pattern.model_copy(update=dict(zip(fields, row, strict=True)))
             for (member, pattern), row in zip(patterns.items(), rows, strict=True)}})
 
     return Variation(values.ravel(), steps, low, high, with_numbers,
-                     list(np.arange(values.size).reshape(members, -1)))
+                     list(np.arange(values.size).reshape(count, -1)))
 
 
 def report_patterns(patterns: Mapping[int, EffectParams], params_sd: np.ndarray,
@@ -108,11 +108,11 @@ class BodyFrameEffect(GainEffect):
 
     @abstractmethod
     def best_pattern(self, view: ResidualView, rows: np.ndarray) -> EffectParams | None:
-        """Find the pattern that fits links of one receiver best; None if it gains little."""
+        """Find the best pattern for `rows` (r,) of one receiver; None if it improves little."""
 
     @override
     def propose(self, view: ResidualView) -> list[Any]:
-        """Propose the pattern of each receiver where one fits its residuals clearly."""
+        """Propose together all patterns that clearly fit receivers of `MIN_LINKS` links."""
         usable, receiver = self.usable(view.links), view.links.receiver
         found = {member: self.best_pattern(view, np.flatnonzero((receiver == member) & usable))
                  for member in frequent_labels(receiver[usable], MIN_LINKS)}
@@ -121,7 +121,7 @@ class BodyFrameEffect(GainEffect):
 
     @override
     def gain_db(self, links: Links) -> np.ndarray:
-        """Compute the gain (n,) by the receivers' patterns on each link [dB]."""
+        """Compute the gain (n,) by the receivers' patterns [dB]; 0 without pattern or heading."""
         gain_db = np.zeros(len(links))
         for receiver, pattern in self.params.receivers.items():
             rows = np.flatnonzero((links.receiver == receiver) & np.isfinite(links.heading_deg))
@@ -176,11 +176,11 @@ def sector_pattern_db(azimuth_deg: np.ndarray, elevation_deg: np.ndarray,
         pattern: parameters of the antenna.
     """
     max_db = pattern.front_to_back_db
-    turn = azimuth_deg - pattern.azimuth_deg
-    off = turn - 360 * np.round(turn / 360)  # ten times as fast as a remainder
-    above = elevation_deg - pattern.tilt_deg
-    horizontal_db = np.minimum(12 * (off / pattern.beamwidth_deg) ** 2, max_db)
-    vertical_db = np.minimum(12 * (above / pattern.vertical_beamwidth_deg) ** 2, max_db)
+    turn_deg = azimuth_deg - pattern.azimuth_deg
+    off_deg = turn_deg - 360 * np.round(turn_deg / 360)  # ten times as fast as a remainder
+    above_deg = elevation_deg - pattern.tilt_deg
+    horizontal_db = np.minimum(12 * (off_deg / pattern.beamwidth_deg) ** 2, max_db)
+    vertical_db = np.minimum(12 * (above_deg / pattern.vertical_beamwidth_deg) ** 2, max_db)
     return -np.minimum(horizontal_db + vertical_db, max_db)
 
 

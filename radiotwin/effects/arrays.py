@@ -79,7 +79,7 @@ def ends_above_ground(links: Links, rows: np.ndarray | slice = slice(None)
 
 
 def subsample(rows: np.ndarray, maximum: int) -> np.ndarray:
-    """Draw at most `maximum` of the rows (n,) at random, and sort them; the seed is fixed.
+    """Draw `maximum` of the rows (n,) at random (fixed seed), sorted; if fewer, return all as is.
 
     Every k-th row would be biased: devices, receivers and slots take turns in a file.
     """
@@ -102,7 +102,7 @@ def frequent_labels(index: np.ndarray, minimum: int) -> list[int]:
 def frequent_anchors(links: Links, minimum: int) -> list[int]:
     """List the devices of declared position with at least `minimum` links, in order.
 
-    A device that these links located wrongly may seem to stand elsewhere or to have an antenna.
+    The error of a position estimated from these links looks like a move or an antenna pattern.
     """
     return [device for device in frequent_labels(links.device, minimum) if device in links.anchors]
 
@@ -134,7 +134,7 @@ def curve_columns(value: np.ndarray, knots: int, circular: bool) -> np.ndarray:
 
 
 def curve_knots(value: np.ndarray, count: int, circular: bool) -> list[float]:
-    """Place knots evenly on the circle [deg], or at evenly spaced quantiles of the values."""
+    """Place knots evenly on the circle [deg], or at evenly spaced quantiles, equal ones merged."""
     if circular:
         return (np.arange(count) * 360.0 / count).tolist()
     return np.unique(np.quantile(value, (np.arange(count) + 0.5) / count)).tolist()

@@ -501,17 +501,17 @@ class ResidualView:
     group: np.ndarray | None = None
 
     def of_group(self, group: np.ndarray) -> ResidualView:
-        """Set the residual to 0 on links that the cause of an odd group (mask (n,)) cannot affect.
+        """Return a view with residual 0 where the cause of an odd group (mask (n,)) cannot act.
 
         A cause may act on all links of the device and receiver that the group has in common, or
         else of its only flight; if the group has none of these in common, on all links.
         """
         links = self.links
-        ends = [label == label[group][0] for label in (links.device, links.receiver)
-                if (label[group] == label[group][0]).all()]
-        if not ends and (links.flight[group] == links.flight[group][0]).all():
-            ends = [links.flight == links.flight[group][0]]
-        may_act = np.all(ends, axis=0) if ends else np.ones(len(links), dtype=bool)
+        masks = [label == label[group][0] for label in (links.device, links.receiver)
+                 if (label[group] == label[group][0]).all()]
+        if not masks and (links.flight[group] == links.flight[group][0]).all():
+            masks = [links.flight == links.flight[group][0]]
+        may_act = np.all(masks, axis=0) if masks else np.ones(len(links), dtype=bool)
         found = replace(self, residual_db=np.where(may_act, self.residual_db, 0.0), group=group)
         vars(found)["design_effect"] = self.design_effect
         return found
@@ -566,8 +566,8 @@ class ResidualView:
     def score(self, term: Term) -> float:
         """Approximate the log-likelihood gain of adding an effect's term to the model [nats].
 
-        Half of the reduction of the weighted squared residuals. The term's coefficients are fitted,
-        and one level each for links with and without line of sight.
+        Half of the reduction of the weighted squared residuals, with fitted coefficients and one
+        level each for links with and without line of sight. The term's `inputs` are ignored.
         """
         weight = self.weight
         target = self.residual_db - term.offset_db
@@ -580,7 +580,7 @@ class ResidualView:
 
 def _weighted_squares(columns: np.ndarray, prior_sd: np.ndarray, target: np.ndarray,
                       weight: np.ndarray) -> float:
-    """Compute the weighted squares, plus penalty, that a ridge regression on columns leaves."""
+    """Compute the weighted residual sum of squares, plus penalty, of a ridge regression."""
     weighted = columns.T * weight
     precision = 1.0 / np.square(prior_sd) + 1e-9
     moments = weighted @ target

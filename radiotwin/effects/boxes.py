@@ -61,11 +61,11 @@ class Box(NamedTuple):
         return self._replace(turn_deg=(self.turn_deg + turn_deg + 90.0) % 180.0 - 90.0)
 
     def like(self, other: "Box") -> "Box":
-        """Return the same box, turned by quarters (sides exchanged) to come closest to another."""
-        quarters = round((other.turn_deg - self.turn_deg) / 90.0)
-        sides = (self.length_m, self.width_m)[::-1 if quarters % 2 else 1]
+        """Return the same box, turned by multiples of 90°, with the turn closest to another's."""
+        quarter_turns = round((other.turn_deg - self.turn_deg) / 90.0)
+        sides = (self.length_m, self.width_m)[::-1 if quarter_turns % 2 else 1]
         return self._replace(length_m=sides[0], width_m=sides[1],
-                             turn_deg=self.turn_deg + 90.0 * quarters)
+                             turn_deg=self.turn_deg + 90.0 * quarter_turns)
 
     @property
     def axes(self) -> np.ndarray:
@@ -99,10 +99,10 @@ def stands_on(box: Box, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
 
 
 class Crossing(NamedTuple):
-    """Geometry of n links that cross a box, (n,) each; NaN if the ground track misses the box.
+    """Geometry of n links that cross a box, (n,) each; NaN where the ground track misses it.
 
     Attributes:
-        inside_m: length of the link within the box; 0 if it passes above.
+        inside_m: length of the link within the box; 0, never NaN, if it passes above or beside.
         enter_over_m, leave_over_m: height of the roof above the link at entry and at exit;
             negative if the link passes above.
         left_m, right_m: lateral extent of the box to each side of the link's track.
@@ -121,7 +121,7 @@ class Crossing(NamedTuple):
 
 
 def cross(box: Box, a_m: np.ndarray, b_m: np.ndarray) -> Crossing:
-    """Compute where links cross a box; NaN where the link's track on the ground misses it.
+    """Compute where links cross a box; if the ground track misses it, all but `inside_m` is NaN.
 
     Args:
         box: box on the ground.
@@ -184,7 +184,7 @@ def _shares_within(start: float, step: float, half: float) -> tuple[float, float
 @njit(cache=True, error_model="numpy")
 def _share_below(start_z_m: float, rise_m: float, enter: float, leave: float,
                  height_m: float) -> float:
-    """Return the fraction of a link, within fractions enter to leave, below a height; < 0: none."""
+    """Return the fraction of a link, from enter to leave, below a height; 0 or less: none."""
     if abs(rise_m) < 1e-9:
         return leave - enter if start_z_m < height_m else 0.0
     roof = (height_m - start_z_m) / rise_m
@@ -316,8 +316,8 @@ def knife_edge_db(over_m: np.ndarray, first_m: np.ndarray | float, second_m: np.
 
     Args:
         over_m: (n,) height of the edge above the straight line [m].
-        first_m: (n,) distance of the edge from the first end [m].
-        second_m: (n,) distance of the edge from the second end [m].
+        first_m: (n,) distance of the edge from the first end; at least 1 is used [m].
+        second_m: (n,) distance from the second end; at least 1 is used [m].
         wavelength_m: wavelength [m].
     """
     near, far = np.maximum(first_m, 1.0), np.maximum(second_m, 1.0)
@@ -364,7 +364,7 @@ def two_edges_db(first_over_m: np.ndarray, second_over_m: np.ndarray,
 
 @lru_cache(maxsize=4)
 def buildings(city: CityMap) -> tuple[np.ndarray, np.ndarray]:
-    """Find the buildings of a map: the connected components of its faces.
+    """Find the buildings of a map: the connected components of its faces, ground included.
 
     Args:
         city: map with f faces.
@@ -376,8 +376,8 @@ def buildings(city: CityMap) -> tuple[np.ndarray, np.ndarray]:
     welded = np.round(city.vertices / WELD_M).astype(np.int64)
     vertex = np.unique(welded, axis=0, return_inverse=True)[1].ravel()
     faces = vertex[city.faces]
-    ends = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
-    graph = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])),
+    edges = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
+    graph = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])),
                        shape=(vertex.max() + 1,) * 2)
     component = connected_components(graph, directed=False)[1]
     label = np.unique(component[faces[:, 0]], return_inverse=True)[1]

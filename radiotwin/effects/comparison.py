@@ -50,9 +50,9 @@ def _other_flights_db(position_m: np.ndarray, flight: np.ndarray, residual_db: n
     count = min(NEIGHBOURS, len(position_m))
     distance_m, near = cKDTree(position_m).query(position_m, count, distance_upper_bound=reach_m)
     distance_m, near = distance_m.reshape(len(position_m), -1), near.reshape(len(position_m), -1)
-    found = np.isfinite(distance_m)
-    near = np.where(found, near, 0)
-    other = found & (flight[near] != flight[:, None])
+    in_reach = np.isfinite(distance_m)
+    near = np.where(in_reach, near, 0)
+    other = in_reach & (flight[near] != flight[:, None])
     value = np.where(other, residual_db[near], np.nan)
     enough = other.sum(axis=1) >= MIN_OTHERS
     result = np.full(len(position_m), np.nan)
@@ -61,7 +61,7 @@ def _other_flights_db(position_m: np.ndarray, flight: np.ndarray, residual_db: n
 
 
 def compared_where_possible_db(view: ResidualView) -> tuple[np.ndarray, np.ndarray]:
-    """Return `compared_db` (n,), with the plain residual where that is NaN, and where it is not."""
+    """Return `compared_db` (n,) [dB], plain residuals where it is NaN, and where it is finite."""
     rest_db = compared_db(view)
     known = np.isfinite(rest_db)
     return np.where(known, rest_db, view.residual_db), known
@@ -76,10 +76,10 @@ def by_precision(view: ResidualView, rest_db: np.ndarray) -> tuple[np.ndarray, n
 
     Args:
         view: n links.
-        rest_db: (n,) residuals minus those of other flights there; NaN = unknown, weight 0.
+        rest_db: (n,) residuals minus the median of other flights at the place; NaN: unknown.
 
     Returns:
-        (n,) values [dB], and (n,) weights [1/dB²].
+        (n,) values [dB], (n,) weights [1/dB²]; both 0 if unknown, or blank as predicted.
     """
     value_db, weight = np.zeros((2, len(rest_db)))
     # A blank has information only if its predicted level is above the limit.

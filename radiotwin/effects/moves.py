@@ -53,21 +53,21 @@ class MovedEnd(GainEffect):
         return self.with_params(self.params, "exact")
 
     def best_move(self, view: ResidualView, ends: Iterable[list[Any]]) -> list[Any]:
-        """Find the trial move with the highest log-likelihood gain; empty if below `MIN_NATS`.
+        """Find the position correction of the highest log-likelihood gain; [] if below `MIN_NATS`.
 
         Args:
             view: residuals.
-            ends: for each device or receiver, the parameters of its trial moves.
+            ends: for each device or receiver, the parameters of its trial positions.
         """
         links, best, most_nats = view.links, [], MIN_NATS
         for moves in ends:
             all_rows = self.with_params(moves[0]).rows(links)
             rows = subsample(all_rows, MAX_PROPOSE_LINKS)
-            given, times = links.select(rows), len(all_rows) / len(rows)
+            given, links_per_row = links.select(rows), len(all_rows) / len(rows)
             before_db = view.level_at(given)
             for params in moves:
                 change_db = view.level_at(self.with_params(params).moved(given)) - before_db
-                nats = times * view.gain_nats(rows, change_db).sum()
+                nats = links_per_row * view.gain_nats(rows, change_db).sum()
                 if nats > most_nats:
                     best, most_nats = [params], nats
         return best

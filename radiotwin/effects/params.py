@@ -87,14 +87,14 @@ class Allowed:
 
     @classmethod
     def of(cls, field: dict[str, Any]) -> "Allowed":
-        """Take the bounds from a field of `quantities`; an angle ranging over 360° is periodic."""
+        """Take bounds from a field of `quantities`; angles spanning more than 360° are periodic."""
         low, high = field["low"], field["high"]
         if field["unit"] == "deg" and high - low > CIRCLE_DEG:
             return cls(period=CIRCLE_DEG)
         return cls(low, high)
 
     def span(self, unit: str) -> float:
-        """Compute the width of the allowed range, or of its natural logarithm if `is_log`.
+        """Compute the width of the allowed range, of its logarithm if `is_log` (open: `RATIOS`).
 
         Args:
             unit: unit of the values; dB and dBm span `LEVELS_DB` at most.

@@ -18,7 +18,7 @@ MAX_MEMBERS = 5  # devices, receivers or flights over which the median is taken
 MAX_PLACES = 3  # the same for boxes, whose search takes longer
 MIN_LINKS = 30  # links of a member, or through a box
 WIDE_M = 20.0  # width of a typical obstacle
-PLACES, SHARES = 40, (0.1, 0.3, 0.5, 0.7, 0.9)  # links with an obstacle, and its places along them
+PLACES, FRACTIONS = 40, (0.1, 0.3, 0.5, 0.7, 0.9)  # links with trial boxes, and where along them
 # Kinds of patterns in the order of the report.
 KINDS = ("receiver", "device", "flight", "distance", "attitude", "direction", "position", "place",
          "building")
@@ -56,7 +56,7 @@ class Pattern:
 
 
 def members(label: np.ndarray) -> list[np.ndarray]:
-    """Return one mask (n,) per label with enough links, `MAX_MEMBERS` at most; of one label, []."""
+    """Return masks (n,) of up to `MAX_MEMBERS` labels of `MIN_LINKS` links; [] for a single one."""
     frequent = frequent_labels(label, MIN_LINKS)
     if len(frequent) < 2:
         return []
@@ -70,19 +70,19 @@ def timed_members(links: Links, label: np.ndarray) -> list[np.ndarray]:
             if timed[mask].mean() > 0.5 and np.ptp(links.time_s[mask & timed]) != 0]
 
 
-def lengths_in_boxes(links: Links, high_m: float) -> Iterator[np.ndarray]:
-    """Yield, for each of some trial boxes, the length (n,) of every link inside the box [m].
+def lengths_in_boxes(links: Links, height_m: float) -> Iterator[np.ndarray]:
+    """Yield the length (n,) of every link inside each trial box, `height_m` above the ground [m].
 
-    Boxes are `WIDE_M` wide and stand on links with line of sight; other links have 0. At most
-    `MAX_PLACES` boxes, from those that few links pass to those that many pass.
+    Boxes are `WIDE_M` wide and placed along links with line of sight; other links have 0. Of those
+    crossed by `MIN_LINKS`, up to `MAX_PLACES`, spread evenly from rarely to often crossed ones.
     """
     rows = np.flatnonzero(links.los)
     a_m, b_m = ends_above_ground(links, rows)
-    passed = np.linspace(0, len(rows) - 1, min(PLACES, len(rows))).astype(int)
+    chosen = np.linspace(0, len(rows) - 1, min(PLACES, len(rows))).astype(int)
     found = []
-    for link, share in product(passed.tolist(), SHARES):
-        x_m, y_m = (a_m[link, :2] + share * (b_m[link, :2] - a_m[link, :2])).tolist()
-        inside_m = cross(Box(x_m, y_m, WIDE_M, WIDE_M, high_m, 0.0), a_m, b_m).inside_m
+    for link, fraction in product(chosen.tolist(), FRACTIONS):
+        x_m, y_m = (a_m[link, :2] + fraction * (b_m[link, :2] - a_m[link, :2])).tolist()
+        inside_m = cross(Box(x_m, y_m, WIDE_M, WIDE_M, height_m, 0.0), a_m, b_m).inside_m
         inside_m = np.where(inside_m > 0, inside_m, 0.0)
         if np.count_nonzero(inside_m) >= MIN_LINKS:
             found.append(inside_m)

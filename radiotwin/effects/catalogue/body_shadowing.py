@@ -100,15 +100,15 @@ class BodyShadowing(BodyFrameEffect):
 
     @override
     def best_pattern(self, view: ResidualView, rows: np.ndarray) -> Body | None:
-        """Find the best shadow of a grid; its level and depth (ridge regression) are fitted."""
-        few = subsample(rows, MAX_LINKS)
-        weight = view.weight[few] * (len(rows) / len(few))
-        residual_db, total = view.residual_db[few], weight.sum()
+        """Find the best shadow of a grid, each with fitted depth and level (ridge regression)."""
+        drawn = subsample(rows, MAX_LINKS)
+        weight = view.weight[drawn] * (len(rows) / len(drawn))
+        residual_db, total = view.residual_db[drawn], weight.sum()
         residual_db = residual_db - weight @ residual_db / total
         azimuth_deg, elevation_deg = (each.ravel() for each in np.meshgrid(
             np.arange(0.0, 360.0, SEARCH_STEP_DEG),
             np.arange(-90.0 + SEARCH_STEP_DEG, 90.0, SEARCH_STEP_DEG)))
-        cosine = _straight(view.links.select(few)) @ _directions(azimuth_deg, elevation_deg).T
+        cosine = _straight(view.links.select(drawn)) @ _directions(azimuth_deg, elevation_deg).T
         best, most_nats = None, MIN_NATS
         for width_deg in SEARCHED_WIDTHS_DEG:
             share = _relative_loss(cosine, width_deg)
@@ -116,12 +116,12 @@ class BodyShadowing(BodyFrameEffect):
             moment = np.maximum(-(weight * residual_db) @ share, 0.0)
             precision = weight @ share**2 + DEPTH_SD_DB**-2
             nats = 0.5 * moment**2 / precision
-            number = int(nats.argmax())
-            if nats[number] > most_nats:
-                most_nats = float(nats[number])
-                best = Body(depth_db=min(float(moment[number] / precision[number]), 40.0),
-                            azimuth_deg=float(azimuth_deg[number]),
-                            elevation_deg=float(elevation_deg[number]), width_deg=width_deg)
+            index = int(nats.argmax())
+            if nats[index] > most_nats:
+                most_nats = float(nats[index])
+                best = Body(depth_db=min(float(moment[index] / precision[index]), 40.0),
+                            azimuth_deg=float(azimuth_deg[index]),
+                            elevation_deg=float(elevation_deg[index]), width_deg=width_deg)
         return best
 
     @override
@@ -131,7 +131,7 @@ class BodyShadowing(BodyFrameEffect):
 
     @override
     def typical_patterns(self, view: ResidualView) -> list[Pattern]:
-        """Return the level change by a shadow 1 dB deep behind the receiver's body."""
+        """Return the level change by a shadow 1 dB deep behind the body; [] without headings."""
         azimuth_deg, depth = view.links.body_azimuth_deg, quantities(Body)["depth_db"]
         if not np.isfinite(azimuth_deg).any():
             return []
@@ -164,6 +164,6 @@ def _directions(azimuth_deg: np.ndarray | float, elevation_deg: np.ndarray | flo
 
 
 def _relative_loss(cosine: np.ndarray, width_deg: float) -> np.ndarray:
-    """Compute loss over depth from the cosine of the angle to the body's middle."""
+    """Compute loss over depth, 0 to 1, from the cosine of the angle to the body's middle."""
     exponent = np.log(0.5) / (2 * np.log(np.cos(np.radians(width_deg / 4))))
     return np.clip((1 + cosine) / 2, 0.0, 1.0) ** exponent

@@ -63,14 +63,13 @@ class ReceiverClockOffset(MovedEnd):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
-        """Propose the receiver and clock offset, a shift along its track, that fit best."""
+        """Propose the receiver (not yet found) and clock offset, along its track, that fit best."""
         known = view.found_params(self.name, "receiver")
         return self.best_move(view, (
             [self.Params(receiver=receiver, offset_s=sign * size_m / speed_m_s, speed_m_s=speed_m_s)
              for size_m in TRIED_M for sign in (-1, 1)]
             for receiver, speed_m_s in sorted(_speeds_m_s(view.links).items())
             if receiver not in known))
-
 
     @override
     def moved(self, links: Links) -> Links:
@@ -107,7 +106,7 @@ def _speeds_m_s(links: Links) -> dict[int, float]:
 
 
 def _at_other_time(links: Links, receiver: int, offset_s: float) -> Links:
-    """Put a receiver where its track was `offset_s` later; links without a time stay."""
+    """Shift all `links`, of one receiver, along its track by `offset_s`; untimed ones stay."""
     receiver_m = links.receiver_m.copy()
     timed = np.flatnonzero(np.isfinite(links.time_s))
     order = timed[np.argsort(links.flight[timed], kind="stable")]

@@ -79,7 +79,7 @@ def level_groups(links: Links, devices: list[int]) -> list[list[int]]:
 
 
 def unshared_sd_db(devices: list[int], groups: list[list[int]]) -> np.ndarray:
-    """Compute the prior sd (k,) of the part of each device's level that no other has [dB].
+    """Compute the prior sd (k,) of the part of each device's level that no other shares [dB].
 
     The device's own variance, and that of its mast and of its direction if it is alone there.
     """
@@ -241,9 +241,9 @@ class DeclaredSectors(SectorEffect):
                             for key in ("step", "low", "high"))
         # The tilt of every antenna stays within its bounds.
         tilts_deg = [pattern.tilt_deg for pattern in params.devices.values()]
-        bounds, at = quantities(SectorPattern)["tilt_deg"], [*fields].index("tilt_offset_deg")
-        low[at] = values[at] + bounds["low"] - min(tilts_deg)
-        high[at] = values[at] + bounds["high"] - max(tilts_deg)
+        bounds, tilt = quantities(SectorPattern)["tilt_deg"], [*fields].index("tilt_offset_deg")
+        low[tilt] = values[tilt] + bounds["low"] - min(tilts_deg)
+        high[tilt] = values[tilt] + bounds["high"] - max(tilts_deg)
 
         def varied(numbers: np.ndarray) -> DeclaredSectors:
             found = dict(zip(fields, numbers.tolist(), strict=True))
@@ -313,13 +313,14 @@ def _turned(links: Links, devices: list[int], shape: SectorPattern, offset_deg: 
             own_turns: dict[int, OwnTurn]) -> dict[int, SectorPattern]:
     """Turn a pattern to each device's declared azimuth and tilt: device -> pattern.
 
-    Azimuths get the common error `offset_deg` and the device's own. The tilt of `shape` is added;
-    a missing declared tilt is replaced by the median of the others, or 0.
+    Azimuths get the common error `offset_deg` and the device's own. The tilt of `shape` is added,
+    within its bounds; a missing declared tilt is replaced by the median of the declared ones, or 0.
     """
-    known = links.tilt_deg[devices]
-    usual = float(np.median(known[np.isfinite(known)])) if np.isfinite(known).any() else 0.0
+    given_deg = links.tilt_deg[devices]
+    known = np.isfinite(given_deg)
+    usual_deg = float(np.median(given_deg[known])) if known.any() else 0.0
     bounds = quantities(SectorPattern)["tilt_deg"]
-    tilts_deg = np.clip(np.where(np.isfinite(known), known, usual) + shape.tilt_deg,
+    tilts_deg = np.clip(np.where(known, given_deg, usual_deg) + shape.tilt_deg,
                         bounds["low"], bounds["high"])
     return {device: shape.model_copy(
         update={"azimuth_deg": float(links.boresight_deg[device]) + offset_deg
@@ -356,19 +357,19 @@ class _Readings(NamedTuple):
     def nats(self, offsets_db: dict[int, np.ndarray]) -> float:
         """Compute the log-likelihood gain of offsets (r,) by device and one fitted level [nats]."""
         rows = np.concatenate([self.parts[device][0] for device in offsets_db])
-        times = np.concatenate([np.full(len(self.parts[device][0]), self.parts[device][1])
-                                for device in offsets_db])
+        links_per_row = np.concatenate([np.full(len(self.parts[device][0]), self.parts[device][1])
+                                        for device in offsets_db])
         offset_db = np.concatenate(list(offsets_db.values()))
         weight = self.view.weight[rows] * np.isfinite(self.view.links.level_db[rows])
         level_db = weight @ (self.view.residual_db[rows] - offset_db) / max(weight.sum(), 1e-12)
-        return float(times @ self.view.gain_nats(rows, offset_db + level_db))
+        return float(links_per_row @ self.view.gain_nats(rows, offset_db + level_db))
 
     def turns(self) -> tuple[float, dict[int, OwnTurn]]:
         """Estimate the common error of declared azimuths, and which devices have another error.
 
         Mixture model: each azimuth has the common error or, rarely, any error, so that a wrong
         azimuth does not bias the others. Each device has its own level; patterns are flat in
-        elevation. Returns the common error [deg] and device -> its own.
+        elevation. Returns the common error [deg] and device -> its error relative to that.
         """
         found: tuple[float, dict[int, OwnTurn]] = (0.0, {})
         view = self.view
@@ -391,7 +392,7 @@ class _Readings(NamedTuple):
                  ) -> tuple[float, float, dict[int, np.ndarray], SectorPattern]:
         """Rate one pattern, flat in elevation, by the mixture of `turns` over azimuth errors.
 
-        Returns log-likelihood [nats], most likely common error [deg], device -> gain of each trial
+        Returns log posterior [nats], likeliest common error [deg], device -> gain of each trial
         error (t,) [nats], and the pattern.
         """
         shape = SectorPattern(beamwidth_deg=width_deg, front_to_back_db=back_db)
@@ -399,21 +400,21 @@ class _Readings(NamedTuple):
         nats = {device: np.array([self.nats({device: rays.offset_db(declared[device].model_copy(
             update={"azimuth_deg": declared[device].azimuth_deg + turn_deg}))})
             for turn_deg in TURNS_DEG]) for device, (_, _, rays) in self.parts.items()}
-        likely = np.log(np.where(TURNS_DEG == 0, 1 - WRONG_TABLE, WRONG_TABLE / len(TURNS_DEG)))
+        log_p = np.log(np.where(TURNS_DEG == 0, 1 - WRONG_TABLE, WRONG_TABLE / len(TURNS_DEG)))
         for turn_nats in nats.values():
             any_turn = float(np.logaddexp.reduce(turn_nats) - np.log(len(turn_nats)))
-            likely = likely + np.logaddexp(np.log(1 - WRONG_AZIMUTH) + turn_nats,
-                                           np.log(WRONG_AZIMUTH) + any_turn)
-        best = int(likely.argmax())
-        return float(likely[best]), float(TURNS_DEG[best]), nats, shape
+            log_p = log_p + np.logaddexp(np.log(1 - WRONG_AZIMUTH) + turn_nats,
+                                         np.log(WRONG_AZIMUTH) + any_turn)
+        best = int(log_p.argmax())
+        return float(log_p[best]), float(TURNS_DEG[best]), nats, shape
 
     def best_shape(self, offset_deg: float, own_turns: dict[int, OwnTurn]
                    ) -> tuple[float, SectorPattern]:
-        """Return the highest gain over a constant level [nats], and the trial pattern with it."""
-        def rate_shape(width: float, back_db: float, tilt: float, height: float
+        """Return the likeliest trial pattern, after its gain over a constant level [nats]."""
+        def rate_shape(width_deg: float, back_db: float, tilt_deg: float, vertical_deg: float
                        ) -> tuple[float, SectorPattern]:
-            shape = SectorPattern(beamwidth_deg=width, front_to_back_db=back_db, tilt_deg=tilt,
-                                  vertical_beamwidth_deg=height)
+            shape = SectorPattern(beamwidth_deg=width_deg, front_to_back_db=back_db,
+                                  tilt_deg=tilt_deg, vertical_beamwidth_deg=vertical_deg)
             turned = _turned(self.view.links, self.devices, shape, offset_deg, own_turns)
             return self.nats({device: rays.offset_db(turned[device])
                               for device, (_, _, rays) in self.parts.items()}), shape

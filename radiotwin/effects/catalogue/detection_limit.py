@@ -47,7 +47,7 @@ class DetectionLimit(LimitEffect):
     def propose(self, view: ResidualView) -> list[Params]:
         """Propose receivers whose readings clearly end above their declared limit of detection."""
         links, found, sd_db = view.links, {}, {}
-        seen = np.isfinite(links.level_db)
+        detected = np.isfinite(links.level_db)
         for receiver in np.unique(links.receiver):
             rows = links.receiver == receiver
             usual_db = float(np.median(links.limit_db[rows]))
@@ -55,7 +55,7 @@ class DetectionLimit(LimitEffect):
                                    view.design_effect, usual_db)
             if (limit is not None and limit.is_sure and limit.limit_db > usual_db + MIN_RISE_DB
                     and (np.isinf(usual_db) or limit.over_declared_nats > MIN_NATS)
-                    and not contradict_limit(links.level_db[rows & seen], limit.limit_db)):
+                    and not contradict_limit(links.level_db[rows & detected], limit.limit_db)):
                 found[int(receiver)], sd_db[int(receiver)] = limit.limit_db, limit.sd_db
         return [self.Params(receivers=found, sd_db=sd_db)] if found else []
 

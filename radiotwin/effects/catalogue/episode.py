@@ -104,7 +104,7 @@ class Episode(GainEffect):
 
     @override
     def unavailable(self, links: Links) -> str | None:
-        """Return why no passing loss can be searched (no times, or one flight only); else None."""
+        """Return why no temporary loss can be searched (no times, or one flight); else None."""
         if np.isfinite(links.time_s).sum() < MIN_LINKS:
             return "there is no time_s"
         if len(np.unique(links.flight)) < 2:
@@ -113,7 +113,7 @@ class Episode(GainEffect):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
-        """Propose the two strongest passing losses, of one receiver or of all at once."""
+        """Propose the two strongest temporary losses, each of one receiver or of all at once."""
         links, found = view.links, []
         rest_db, known = compared_where_possible_db(view)
         value_db, weight = by_precision(view, rest_db)
@@ -242,15 +242,15 @@ def _strongest(links: Links, values_db: np.ndarray, weights: np.ndarray,
     time_s, rest_db, weight = links.time_s[rows], values_db[rows], weights[rows]
     distance_km = links.distance_m[rows] / 1000
     times_s = np.unique(time_s)
-    ends = times_s[np.unique(np.linspace(0, len(times_s) - 1, BINS).round().astype(int))]
-    best = _best_window(ends, time_s, rest_db, weight, distance_km)
-    if best is None or len(ends) == len(times_s):
+    ends_s = times_s[np.unique(np.linspace(0, len(times_s) - 1, BINS).round().astype(int))]
+    best = _best_window(ends_s, time_s, rest_db, weight, distance_km)
+    if best is None or len(ends_s) == len(times_s):
         return best
-    coarse = np.max(np.diff(np.searchsorted(times_s, ends)))
+    coarse = np.max(np.diff(np.searchsorted(times_s, ends_s)))
     near = [np.abs(np.arange(len(times_s)) - np.searchsorted(times_s, end_s)) <= coarse
             for end_s in (best.start_s, best.end_s)]
-    ends = times_s[near[0] | near[1]]
-    return _best_window(np.unique(np.r_[times_s[0], ends, times_s[-1]]), time_s, rest_db, weight,
+    ends_s = times_s[near[0] | near[1]]
+    return _best_window(np.unique(np.r_[times_s[0], ends_s, times_s[-1]]), time_s, rest_db, weight,
                         distance_km) or best
 
 
@@ -298,7 +298,6 @@ def _sums(cell: np.ndarray, value: np.ndarray, cells: int) -> np.ndarray:
     return np.r_[0.0, np.cumsum(np.bincount(cell, weights=value, minlength=cells))]
 
 
-
 def _most_members_agree(links: Links, value_db: np.ndarray, weight: np.ndarray, known: np.ndarray,
                         rows: np.ndarray, inside: np.ndarray) -> bool:
     """Check whether most devices, and most receivers, show the loss in the window of time.
@@ -326,7 +325,6 @@ def _most_members_agree(links: Links, value_db: np.ndarray, weight: np.ndarray, 
                            MIN_MEMBER_LINKS, 0.3 * change_db) >= MIN_MEMBERS
                for label in (links.device, links.receiver)
                if np.bincount(label[during]).max() >= MIN_MEMBER_LINKS)
-
 
 
 def _is_step_or_flight(links: Links, params: Any, inside: np.ndarray) -> bool:

@@ -57,9 +57,9 @@ class ExcessAttenuation(GainEffect):
     def term(self, links: Links, level_at: LevelAt) -> Term:
         """Return the column -(distance [km] × mean relative density); its coefficient is dB/km."""
         height_m = self.params.scale_height_m
-        low = np.minimum(links.device_m[links.device, 2], links.receiver_m[:, 2])
+        low_m = np.minimum(links.device_m[links.device, 2], links.receiver_m[:, 2])
         rise = np.maximum(np.abs(links.offset_m[:, 2]), 1e-3) / height_m
-        density = np.exp(-np.maximum(low, 0.0) / height_m) * -np.expm1(-rise) / rise
+        density = np.exp(-np.maximum(low_m, 0.0) / height_m) * -np.expm1(-rise) / rise
         return Term.of_columns((-links.distance_m / 1000 * density)[:, None], PRIOR_SD_DB_KM)
 
     @override

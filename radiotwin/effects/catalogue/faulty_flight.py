@@ -183,11 +183,11 @@ class FaultyFlight(GainEffect):
 def _flights(view: ResidualView) -> list[_Flight]:
     """Compute level, scatter and roughness of each receiver's flights with enough readings."""
     links = view.links
-    seen = np.isfinite(links.level_db)
-    pairs = np.unique(np.column_stack([links.receiver, links.flight])[seen], axis=0)
-    rows = [np.flatnonzero(seen & (links.receiver == receiver) & (links.flight == flight))
+    detected = np.isfinite(links.level_db)
+    pairs = np.unique(np.column_stack([links.receiver, links.flight])[detected], axis=0)
+    rows = [np.flatnonzero(detected & (links.receiver == receiver) & (links.flight == flight))
             for receiver, flight in pairs]
-    residuals_db = [np.where(seen, values_db, np.nan)
+    residuals_db = [np.where(detected, values_db, np.nan)
                     for values_db in (compared_db(view), view.residual_db)]
     levels_db = np.column_stack([_levels_db(*by_precision(view, values_db), rows, pairs[:, 0],
                                             links) for values_db in residuals_db])
@@ -224,7 +224,7 @@ def _levels_db(value_db: np.ndarray, weight: np.ndarray, rows: list[np.ndarray],
 
 def _devices_agree(value_db: np.ndarray, weight: np.ndarray, level_db: float,
                    device: np.ndarray) -> bool:
-    """Check whether most devices differ as the flight does: by 0.4 of its level or more."""
+    """Check whether most devices differ by 0.4 of the flight's level; True with few links each."""
     if len(np.unique(device)) > len(device) / MIN_DEVICE_LINKS:  # places of a moving device
         return True
     return share_alike(device, value_db, weight, MIN_DEVICE_LINKS, 0.4 * level_db) >= MIN_DEVICES
@@ -244,7 +244,10 @@ def _steps_db(residual_db: np.ndarray, links: Links) -> np.ndarray:
 
 
 def _disagreement(flight: _Flight, flights: list[_Flight], links: Links) -> tuple[float, float]:
-    """Compute the p-value that a flight is like others, over all tests, and added scatter [dB]."""
+    """Compute the p-value, over all tests, that a flight is like others, and added scatter [dB].
+
+    The level of a receiver's first or last flight is not tested: it may be a step in time.
+    """
     others = [other for other in flights if other.flight != flight.flight]
     noisy = [_excess_scatter(log_scatter, np.array([other.log_scatters[kind] for other in others]),
                              prior_sd)
@@ -300,7 +303,7 @@ def _offset_p_value(flight: _Flight, others: list[_Flight], kind: int, links: Li
 
 
 def is_first_or_last(receiver: int, flight: int, links: Links) -> bool:
-    """Check whether a flight is the receiver's first or last, so that it may be a step in time."""
+    """Check whether a flight is the receiver's first or last; False if flights have no order."""
     times = {number: time_s[0] for (index, number), (time_s, _) in links.tracks.items()
              if index == receiver}
     if links.time_restarts or flight not in times:

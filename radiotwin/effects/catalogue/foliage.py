@@ -2,7 +2,7 @@
 
 Loss over d metres inside: A_m (1 − exp(−γ d / A_m)), saturating (ITU-R P.833-10, Eq. 1), with A_m
 up to that of the recommendation at the frequency. It is located by back-projection. If only links
-of one device pass it, its distance along them is unknown, and the box gives its direction only.
+of one device cross it, its distance along them is unknown, and the box gives its direction only.
 """
 
 from collections.abc import Iterator
@@ -76,7 +76,7 @@ class Foliage(GainEffect):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
-        """Propose boxes of vegetation where links lack power, at the best places of the ground."""
+        """Propose boxes of vegetation where links lack power, at the best ground cells."""
         links = view.links
         nats = obstruction_nats(view.residual_db, view.scale_db, LOSSES_DB) / view.design_effect
         centres_m, total_nats = back_project(*ends_above_ground(links), nats)

@@ -74,7 +74,7 @@ class _GainOffset(GainEffect):
         return self._of_members(view, self.params.members)
 
     def _of_members(self, view: ResidualView, among: list[int]) -> list[Params]:
-        """Propose offsets of those in `among` with enough links, and the sd of mean residuals."""
+        """Propose offsets of members of `among` with `MIN_LINKS` links, and the sd of offsets."""
         index = self._index(view.links)
         members = [member for member in frequent_labels(index, MIN_LINKS) if member in among]
         if not members:

@@ -78,7 +78,7 @@ class GroundReflection(GainEffect):
         """Propose ground height, roughness and strength of a reflection that fit the residuals."""
         rows = subsample(np.flatnonzero(view.links.los), MAX_PROPOSE_LINKS)
         part, weight = view.links.select(rows), view.weight[rows]
-        share = view.links.los.sum() / max(len(rows), 1)
+        links_per_row = view.links.los.sum() / max(len(rows), 1)
         wavelength_m = speed_of_light / part.frequency_hz
 
         def squares(offset_db: np.ndarray | float) -> float:
@@ -90,7 +90,7 @@ class GroundReflection(GainEffect):
             tried = [self.Params(strength=strength, roughness_m=roughness * wavelength_m,
                                  ground_m=ground_m, wavelength_m=wavelength_m)
                      for strength in STRENGTHS for roughness in ROUGHNESSES]
-            nats = [0.5 * share * (before - squares(self.with_params(params).gain_db(part)))
+            nats = [0.5 * links_per_row * (before - squares(self.with_params(params).gain_db(part)))
                     for params in tried]
             best.append((max(nats), tried[int(np.argmax(nats))]))
         best = [pair for pair in sorted(best, key=lambda pair: -pair[0]) if pair[0] > MIN_NATS]
@@ -98,7 +98,7 @@ class GroundReflection(GainEffect):
 
     @override
     def gain_db(self, links: Links) -> np.ndarray:
-        """Compute the level (n,) of direct plus ground-reflected ray over the direct one [dB]."""
+        """Compute the level (n,) of both rays over the direct one [dB]; 0 if one is blocked."""
         offset_db = np.zeros(len(links))
         clear, device_m, receiver_m = self.of_links.get(links, None, lambda: _bounces(links))
         rows = np.flatnonzero(clear)
@@ -152,9 +152,9 @@ def bounces_on_terrain(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarr
     height_m = [np.maximum(end_m[:, 2] - city.ground_height_m(*end_m[:, :2].T), MIN_END_HEIGHT_M)
                 for end_m in (device_m, receiver_m)]
     share = height_m[0] / (height_m[0] + height_m[1])
-    at_m = device_m + share[:, None] * (receiver_m - device_m)
+    bounce_m = device_m + share[:, None] * (receiver_m - device_m)
     for _ in range(BOUNCE_ROUNDS):
-        touch_m = np.column_stack([at_m[:, :2], city.ground_height_m(*at_m[:, :2].T)])
+        touch_m = np.column_stack([bounce_m[:, :2], city.ground_height_m(*bounce_m[:, :2].T)])
         normal = _slope_normals(city, touch_m)
         above_m = [np.einsum("ij,ij->i", end_m - touch_m, normal)
                    for end_m in (device_m, receiver_m)]
@@ -162,10 +162,10 @@ def bounces_on_terrain(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarr
         share = np.clip(above_m[0] / sum_m, 0.0, 1.0)
         feet_m = [end_m - height[:, None] * normal
                   for end_m, height in zip((device_m, receiver_m), above_m)]
-        at_m = feet_m[0] + share[:, None] * (feet_m[1] - feet_m[0])
-    off_m = np.abs(at_m[:, 2] - city.ground_height_m(*at_m[:, :2].T))
+        bounce_m = feet_m[0] + share[:, None] * (feet_m[1] - feet_m[0])
+    off_m = np.abs(bounce_m[:, 2] - city.ground_height_m(*bounce_m[:, :2].T))
     clear = los & (off_m < OFF_GROUND_M) & (np.minimum(*above_m) >= MIN_END_HEIGHT_M)
-    raised_m = at_m + (BOUNCE_M + off_m)[:, None] * [0.0, 0.0, 1.0]
+    raised_m = bounce_m + (BOUNCE_M + off_m)[:, None] * [0.0, 0.0, 1.0]
     clear[clear] = (city.line_of_sight(device_m[clear], raised_m[clear])
                     & city.line_of_sight(raised_m[clear], receiver_m[clear]))
     flat_m, none = np.linalg.norm(feet_m[1] - feet_m[0], axis=1), np.zeros(len(device_m))
@@ -199,7 +199,7 @@ def _has_bounce(links: Links) -> np.ndarray:
 
 def two_ray_db(device_m: np.ndarray, receiver_m: np.ndarray, frequency_hz: float, strength: float,
                roughness_m: float, ground_m: float) -> np.ndarray:
-    """Compute the level (n,) of direct and reflected ray relative to the direct one [dB].
+    """Compute the level (n,) of direct plus reflected ray over the direct, ≥ `DEEPEST_DB` [dB].
 
     Args:
         device_m: (n, 3) positions of the devices [m].
@@ -207,7 +207,7 @@ def two_ray_db(device_m: np.ndarray, receiver_m: np.ndarray, frequency_hz: float
         frequency_hz: carrier frequency [Hz].
         strength: reflection coefficient relative to smooth medium dry ground.
         roughness_m: standard deviation of the surface's height [m].
-        ground_m: height of the plane [m].
+        ground_m: height of the plane; ends count as `MIN_END_HEIGHT_M` above it or more [m].
     """
     from radiotwin.propagation.paths.interactions import (  # imported late: loads numba
         VACUUM_PERMITTIVITY_F_M,

@@ -177,8 +177,8 @@ def _gains_nats(view: ResidualView, rows: np.ndarray,
     root = np.sqrt(view.weight[rows])
     decades = np.log10(part.distance_m)
     columns = np.column_stack([part.los, part.los * decades, ~part.los, ~part.los * decades])
-    basis, size, _ = np.linalg.svd(columns * root[:, None], full_matrices=False)
-    basis = basis[:, size > 1e-9 * size[0]]
+    basis, singular_values, _ = np.linalg.svd(columns * root[:, None], full_matrices=False)
+    basis = basis[:, singular_values > 1e-9 * singular_values[0]]
     target = root * view.residual_db[rows]
     target = target - basis @ (basis.T @ target)
     nats, levels_db = np.empty((2, len(positions_m), len(QUANTILES)))

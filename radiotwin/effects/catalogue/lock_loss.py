@@ -57,7 +57,6 @@ STEP_DB, MAX_CHANGE_DB = 1.0, 6.0  # the same for a drop
 MAX_DROP_DB = 80.0  # dynamic range of a good receiver
 
 
-
 @dataclass(frozen=True, eq=False)
 class _States:
     """Mixture of two states over i instants."""
@@ -72,7 +71,7 @@ class _States:
 
 def _find_drops(view: ResidualView, receiver: int,
                 rows: np.ndarray) -> tuple[_States, np.ndarray] | None:
-    """Find random drops in a receiver's readings (rows), and each one's log-likelihood gain [nats].
+    """Find random drops in a receiver's readings `rows` (r,), and each one's gain (r,) [nats].
 
     None if they are too weak, do not come and go, or are as frequent for other receivers.
     """
@@ -98,7 +97,7 @@ def _find_drops(view: ResidualView, receiver: int,
 
 
 def _instants(links: Links, rows: np.ndarray) -> np.ndarray:
-    """Assign each link (n,) to an instant by flight and time; one without a time has its own."""
+    """Return the instant (r,) of each row by flight and time; one without a time has its own."""
     time_s = links.time_s[rows]
     key = np.where(np.isfinite(time_s), time_s, rows)
     _, instant = np.unique(np.column_stack([links.flight[rows], key]), axis=0, return_inverse=True)
@@ -177,7 +176,7 @@ class LockLoss(DetectionEffect):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
-        """Propose the share of links that each receiver loses, or weakens, at random."""
+        """Propose shares of blank links by receiver; and separately, shares and sizes of drops."""
         links, blank, shares, drops_db = view.links, {}, {}, {}
         # Behind buildings links are also blank, or weak, because there is no path.
         clear = links.los if links.los.any() else np.ones(len(links), dtype=bool)
@@ -186,9 +185,9 @@ class LockLoss(DetectionEffect):
             probability = _blank_share(view, rows)
             if probability is not None:
                 blank[receiver] = probability
-            heard = rows[np.isfinite(links.level_db[rows])]
-            found = _find_drops(view, receiver, heard) if len(heard) >= MIN_LINKS else None
-            if found is not None and _most_devices_gain(links.device[heard], found[1]):
+            detected = rows[np.isfinite(links.level_db[rows])]
+            found = _find_drops(view, receiver, detected) if len(detected) >= MIN_LINKS else None
+            if found is not None and _most_devices_gain(links.device[detected], found[1]):
                 shares[receiver], drops_db[receiver] = found[0].share, found[0].drop_db
         proposed = [self.Params(receivers=blank)] if blank else []
         if shares:
@@ -248,7 +247,7 @@ def _blank_share(view: ResidualView, rows: np.ndarray) -> float | None:
     """Estimate the probability that a receiver loses a link (rows) whatever its level.
 
     By maximum likelihood, beside links that are undetected as their level is below the limit. None
-    if losses of that kind do not explain the blanks clearly better.
+    if a limit is unknown, or if random losses do not explain the blanks clearly better.
     """
     links = view.links
     blank = np.isnan(links.level_db[rows])
@@ -281,7 +280,7 @@ def _likeliest(below: np.ndarray, blank: np.ndarray) -> tuple[float, np.ndarray]
 
 
 def _most_devices_gain(device: np.ndarray, nats: np.ndarray) -> bool:
-    """Check whether most devices with enough links have a positive sum of gains (n,) [nats]."""
+    """Check whether most devices with enough links gain likelihood; True if there are none."""
     counts, sums = np.bincount(device), np.bincount(device, weights=nats)
     enough = counts >= MIN_DEVICE_LINKS
     return not enough.any() or float((sums[enough] > 0).mean()) > MIN_DEVICES

@@ -46,7 +46,7 @@ class MappedVegetation(GainEffect):
 
     @override
     def unavailable(self, links: Links) -> str | None:
-        """Return why mapped vegetation cannot be tested (none, or few links pass it); else None."""
+        """Return why mapped vegetation cannot be tested (none, or few links in it); else None."""
         if missing := super().unavailable(links):
             return missing
         if not len(city_of(links, self.name).vegetation):

@@ -318,7 +318,7 @@ class MissingObstacle(GainEffect):
 
 
 def _shadow_options(links: Links, options: tuple[T, ...]) -> tuple[T, ...]:
-    """Return the trial powers in a shadow; without a map, which would predict it, the first one."""
+    """Return the trial options of a shadow; without a map, which would predict it, the first."""
     return options if links.city is not None else options[:1]
 
 

@@ -61,9 +61,9 @@ class NoiseFloor(ReceiverEffect):
     def propose(self, view: ResidualView) -> list[Params]:
         """Propose noise floors of receivers [dB], among quantiles of their readings."""
         links, found, sure, highest = view.links, {}, {}, {}
-        seen = np.isfinite(links.level_db)
-        for receiver in frequent_labels(links.receiver[seen], MIN_LINKS):
-            rows = seen & (links.receiver == receiver)
+        detected = np.isfinite(links.level_db)
+        for receiver in frequent_labels(links.receiver[detected], MIN_LINKS):
+            rows = detected & (links.receiver == receiver)
             mean_db, weight = view.mean_db[rows], view.weight[rows]
             residual_db = view.residual_db[rows]
             highest[receiver] = float(np.quantile(links.level_db[rows], MAX_BELOW)) + BELOW_DB
@@ -82,8 +82,8 @@ class NoiseFloor(ReceiverEffect):
             return []
         # A law fitted without a floor is too flat and hides it, so typical floors are tried, too.
         tried = [{receiver: min(highest[receiver], float(np.nanquantile(
-            links.level_db[links.receiver == receiver], share))) for receiver in found}
-            for share in COMMON_QUANTILES]
+            links.level_db[links.receiver == receiver], quantile))) for receiver in found}
+            for quantile in COMMON_QUANTILES]
         # If links are blank below a limit of detection, most receivers cannot have a noise floor
         # above that limit, but a few may.
         single = sure and sure.keys() != found.keys()

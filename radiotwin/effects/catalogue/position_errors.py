@@ -125,7 +125,10 @@ class DevicePositionError(_MovedDevices):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
-        """Propose the move of the mast whose links gain most from it; empty if they gain little."""
+        """Propose the position correction of a mast not yet found that raises the likelihood most.
+
+        Devices of fewer than `MIN_LINKS` links are left out; empty if it gains under `MIN_NATS`.
+        """
         links = view.links
         known = {other for device in view.found_params(self.name, "device")
                  for other in site_of(links, device)}
@@ -222,13 +225,13 @@ class DeviceMoved(_MovedDevices):
         rows = subsample(device_rows, MAX_PROPOSE_LINKS)
         device_links = links.select(rows)
         flights = flights_by_time(device_links)
-        place = np.array([flights.index(flight) for flight in device_links.flight.tolist()])
+        flight_number = np.array([flights.index(flight) for flight in device_links.flight.tolist()])
         before_db = view.level_at(device_links)
         best: tuple[float, int, bool, tuple[float, float]] = (-np.inf, 0, False, (0.0, 0.0))
         for move_m in _moves_around_m():
             moved = self.with_params(self.Params(device=device, flights=[""], move_m=move_m))
             change_db = view.level_at(moved.moved(device_links)) - before_db
-            nats = np.bincount(place, weights=view.gain_nats(rows, change_db),
+            nats = np.bincount(flight_number, weights=view.gain_nats(rows, change_db),
                                minlength=len(flights))
             up_to = np.cumsum(nats)
             for first in range(1, len(flights)):
@@ -292,7 +295,7 @@ class ReceiverPositionError(_PositionError):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
-        """Propose the receiver and the shift of its positions that raise the likelihood most."""
+        """Propose the receiver (not yet found) and shift that raise the likelihood most."""
         moves = [sign * size_m * np.array(axis) for axis in RECEIVER_AXES
                  for size_m in RECEIVER_MOVES_M for sign in (-1, 1)]
         known = set(view.found_params(self.name, "receiver"))
@@ -301,7 +304,6 @@ class ReceiverPositionError(_PositionError):
         return self.best_move(view, (
             [self.Params(receiver=receiver, move_m=tuple(move_m.tolist())) for move_m in moves]
             for receiver in receivers))
-
 
     @override
     def moved(self, links: Links) -> Links:

@@ -63,9 +63,9 @@ class ReceiverSaturation(ReceiverEffect):
     def propose(self, view: ResidualView) -> list[Params]:
         """Propose a compression for each receiver whose strongest readings clearly lack power."""
         links, found = view.links, {}
-        seen = np.isfinite(links.level_db)
-        for receiver in frequent_labels(links.receiver[seen], MIN_LINKS):
-            rows = seen & (links.receiver == receiver)
+        detected = np.isfinite(links.level_db)
+        for receiver in frequent_labels(links.receiver[detected], MIN_LINKS):
+            rows = detected & (links.receiver == receiver)
             mean_db, weight = view.mean_db[rows], view.weight[rows]
             residual_db = view.residual_db[rows]
             best_nats, best = 0.0, None

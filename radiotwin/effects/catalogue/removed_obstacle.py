@@ -81,10 +81,10 @@ class RemovedObstacle(GainEffect):
         gains = {building: _gain_nats(view, building, _without(links.city, building)[0])
                  for building in likely}
         for building in sorted(gains, key=gains.__getitem__, reverse=True):
-            least = gains[building] - MIN_LEAD_NATS
-            lower_m = building_height_sds_m(links.city)[building] * np.array(LOWER)
-            if least > 0 and all(_gain_nats(view, building, _lower(links.city, building, by_m))
-                                 < least for by_m in lower_m.tolist()):
+            limit_nats = gains[building] - MIN_LEAD_NATS
+            lower_by_m = building_height_sds_m(links.city)[building] * np.array(LOWER)
+            if limit_nats > 0 and all(_gain_nats(view, building, _lower(links.city, building, by_m))
+                                      < limit_nats for by_m in lower_by_m.tolist()):
                 return [self.Params(building=building,
                                     centre_m=tuple(centres_m[building].tolist()))]
         return []
@@ -186,7 +186,7 @@ def _lower(city: CityMap, building: int, by_m: float) -> CityMap:
 
 @lru_cache(maxsize=32)
 def _without(city: CityMap, building: int) -> tuple[CityMap, Box]:
-    """Remove a building from a map; also return the box around it."""
+    """Remove a building from a map, and return the box around it; BadInput: no such building."""
     label, centres_m = buildings(city)
     if building >= len(centres_m):
         raise BadInput(f"the effect removed_obstacle removes building {building}, but the map has "

@@ -109,21 +109,21 @@ def roof_crossings(city: CityMap, a_m: np.ndarray, b_m: np.ndarray,
         if building not in boxes:
             continue
         crossing = cross(boxes[building], a_m, b_m)
-        near = np.flatnonzero((crossing.before_m > END_M) & (crossing.behind_m > END_M))
-        if not len(near):
+        rows = np.flatnonzero((crossing.before_m > END_M) & (crossing.behind_m > END_M))
+        if not len(rows):
             continue
-        before_m, between_m = crossing.before_m[near], crossing.between_m[near]
-        track_m = before_m + between_m + crossing.behind_m[near]
+        before_m, between_m = crossing.before_m[rows], crossing.between_m[rows]
+        track_m = before_m + between_m + crossing.behind_m[rows]
         along_m = before_m[:, None] + share * between_m[:, None]
-        points_m = a_m[near, None] + (along_m / track_m[:, None])[..., None] * (
-            b_m - a_m)[near, None]
+        points_m = a_m[rows, None] + (along_m / track_m[:, None])[..., None] * (
+            b_m - a_m)[rows, None]
         over_m = _roof_over_m(city, points_m.reshape(-1, 3), label == building)
         over_m = over_m.reshape(along_m.shape)
         is_over = np.isfinite(over_m)
         hit = np.flatnonzero(is_over.any(axis=1))
         first, last = is_over[hit].argmax(axis=1), SAMPLES - 1 - is_over[hit, ::-1].argmax(axis=1)
         enter_m, leave_m = along_m[hit, first], along_m[hit, last]
-        found.append(np.array([near[hit], np.full(len(hit), building), over_m[hit, first],
+        found.append(np.array([rows[hit], np.full(len(hit), building), over_m[hit, first],
                                over_m[hit, last], enter_m, leave_m - enter_m,
                                track_m[hit] - leave_m]))
     pairs = np.concatenate(found, axis=1)
@@ -242,9 +242,9 @@ def with_model_error(roofs: Sequence[Roof]) -> tuple[Roof, ...]:
     found = []
     for number, roof in enumerate(roofs):
         others_m, sd_m = (np.delete(values, number) for values in (offset_m, link_sd_m))
-        seen = max(len(others_m) - 1, 0)
-        scatter = ((others_m - others_m.mean()) ** 2).sum() if seen else 0.0
-        variance = (MODEL_ROOFS * MODEL_SD_M**2 + scatter) / (MODEL_ROOFS + seen)
+        freedom = max(len(others_m) - 1, 0)
+        scatter = ((others_m - others_m.mean()) ** 2).sum() if freedom else 0.0
+        variance = (MODEL_ROOFS * MODEL_SD_M**2 + scatter) / (MODEL_ROOFS + freedom)
         weight = 1 / (sd_m**2 + variance)
         common_variance = 1 / (weight.sum() + 1 / COMMON_SD_M**2)
         found.append(roof._replace(
@@ -286,13 +286,13 @@ class _Search:
         """Estimate roofs' height errors, each with the others fixed; without small, unsure ones."""
         label, centres_m = buildings(self._city)
         priors_m = building_height_sds_m(self._city)
-        tall_m = centres_m[:, 2] - building_extents_m(self._city, label)[0][:, 2]
+        heights_m = centres_m[:, 2] - building_extents_m(self._city, label)[0][:, 2]
         crossings_of = {int(building): np.flatnonzero(self._crossings.building == building)
                         for building in np.unique(self._crossings.building)}
         found: dict[int, Roof] = {}
         for _ in range(SWEEPS):
             for building, crossings in crossings_of.items():
-                offset_m, sd_m = self._estimate(crossings, float(tall_m[building]),
+                offset_m, sd_m = self._estimate(crossings, float(heights_m[building]),
                                                 float(priors_m[building]))
                 self._loss_db[crossings] = self._crossings.loss_db(offset_m, self._wavelength_m,
                                                                    crossings)
@@ -302,11 +302,11 @@ class _Search:
         return tuple(roof for roof in with_model_error(determined)
                      if abs(roof.offset_m) >= MIN_OFFSET_M)
 
-    def _estimate(self, crossings: np.ndarray, tall_m: float,
+    def _estimate(self, crossings: np.ndarray, height_m: float,
                   prior_sd_m: float) -> tuple[float, float]:
         """Estimate a roof's true minus mapped height and its sd [m]; 0 if its links cannot tell."""
         offsets_m = prior_sd_m * OFFSETS
-        offsets_m = offsets_m[offsets_m > (LEAST_SHARE - 1) * tall_m]
+        offsets_m = offsets_m[offsets_m > (LEAST_SHARE - 1) * height_m]
         link = self._crossings.link[crossings]
         without_db = self._loss_db.copy()
         without_db[crossings] = 0.0
@@ -348,5 +348,5 @@ def _contrast_db(links: Links, level_at: LevelAt) -> np.ndarray:
 
 
 def _level_db(loss_db: np.ndarray, contrast_db: np.ndarray) -> np.ndarray:
-    """Add the power over roofs, `loss_db` below line of sight, to that of other paths [dB]."""
+    """Add the powers over roofs and on other paths, given as losses from line of sight [dB]."""
     return 10 * np.log10(10 ** (-loss_db / 10) + 10 ** (-contrast_db / 10))

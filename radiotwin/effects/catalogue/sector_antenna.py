@@ -39,7 +39,7 @@ class SectorAntenna(SectorEffect):
 
     @override
     def propose(self, view: ResidualView) -> list[SectorEffect.Params]:
-        """Propose a sector antenna for the device that gains most, and for all on its mast."""
+        """Propose sector antennas for the best-fitting device's mast, and for that device alone."""
         known = {device for devices in view.found_params(self.name, "devices")
                  for device in devices}
         devices = sorted((set(frequent_anchors(view.links, MIN_LINKS)) - known)
@@ -100,7 +100,7 @@ def _signed_deg(angle_deg: np.ndarray) -> np.ndarray:
 
 def _best_patterns(view: ResidualView, devices: list[int],
                    straight: bool) -> dict[int, tuple[SectorPattern, float]]:
-    """Find device -> best pattern and its gain [nats], for devices above `MIN_NATS`."""
+    """Find device -> best pattern and its log-likelihood gain, where above `MIN_NATS` [nats]."""
     found = {}
     for device in devices:
         device_rows = np.flatnonzero(view.links.device == device)
@@ -116,7 +116,7 @@ def _best_patterns(view: ResidualView, devices: list[int],
 
 def _best_pattern(view: ResidualView, rows: np.ndarray,
                   straight: bool) -> tuple[SectorPattern, float]:
-    """Find the trial pattern that fits links best, and its gain over a constant level [nats]."""
+    """Find the likeliest trial pattern, and its gain in likelihood over a constant level [nats]."""
     rays, residual_db = Departures.of(view.links, rows, straight), view.residual_db[rows]
     weight = view.weight[rows] * np.isfinite(view.links.level_db[rows])
 
@@ -124,10 +124,11 @@ def _best_pattern(view: ResidualView, rows: np.ndarray,
         level_db = weight @ (residual_db - offset_db) / max(weight.sum(), 1e-12)
         return float(view.gain_nats(rows, offset_db + level_db).sum())
 
-    def rate_pattern(azimuth: float, width: float, back_db: float, tilt: float = 0.0,
-                     height: float = 360.0) -> tuple[float, SectorPattern]:
-        pattern = SectorPattern(azimuth_deg=azimuth, beamwidth_deg=width, front_to_back_db=back_db,
-                                tilt_deg=tilt, vertical_beamwidth_deg=height)
+    def rate_pattern(azimuth_deg: float, width_deg: float, back_db: float, tilt_deg: float = 0.0,
+                     vertical_deg: float = 360.0) -> tuple[float, SectorPattern]:
+        pattern = SectorPattern(
+            azimuth_deg=azimuth_deg, beamwidth_deg=width_deg, front_to_back_db=back_db,
+            tilt_deg=tilt_deg, vertical_beamwidth_deg=vertical_deg)
         return nats(rays.offset_db(pattern)), pattern
 
     # Of equal gains the pattern with the largest numbers is taken.
