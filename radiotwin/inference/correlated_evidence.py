@@ -104,7 +104,7 @@ class CorrelatedEvidence:
         return cls(rows, parts, bases, np.concatenate(spectra), length_m)
 
     def rotated(self, values: np.ndarray) -> np.ndarray:
-        """Transform values (n, …) of all rows into the eigenbasis (m, …)."""
+        """Select `rows` of values (n, …), and transform them into the eigenbasis (m, …)."""
         used = values[self.rows]
         return np.concatenate([basis.T @ used[part] for part, basis in
                                zip(self.parts, self.bases, strict=True)]) if self.parts else used

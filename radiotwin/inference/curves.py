@@ -38,7 +38,7 @@ class Curves:
     Attributes:
         log_likelihood: (p, grid) of each standard deviation in `SD_GRID`; 0 if not judged.
         log_null: (p,) log likelihood as one of its peers.
-        judged: (p,) bool, whether the curve has enough bins.
+        judged: (p,) bool, whether at least MIN_BINS bins of the curve have a level.
         bins: part of the data -> level of each bin minus the median of its curve (k,), with errors.
     """
 
@@ -60,7 +60,7 @@ class Curves:
         return np.where(self.judged, odds, np.nan)
 
     def sd(self, quantile: float) -> np.ndarray:
-        """Compute a posterior quantile (p,) of the standard deviation of each curve's bins."""
+        """Compute a posterior quantile (p,) of the sd of each judged curve's bins [dB]."""
         weight = np.exp(self.log_likelihood - self.log_likelihood.max(axis=1, keepdims=True))
         share = np.cumsum(weight, axis=1)
         share /= share[:, -1:]
@@ -68,7 +68,7 @@ class Curves:
 
     @property
     def size(self) -> np.ndarray:
-        """(p,) standard deviation of the bins; NaN = not judged."""
+        """(p,) posterior median of the standard deviation of the bins [dB]; NaN = not judged."""
         return np.where(self.judged, self.sd(0.5), np.nan)
 
     def fitted(self, curve: int, part: str) -> np.ndarray:

@@ -134,8 +134,7 @@ class Statistic:
 def medians(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
     """Compute the median (count,) of values (m,) by group (m,); NaN for an empty group.
 
-    Exact to 2⁻³² of the span of values: group and value are sorted as one integer, ten times as
-    fast as a sort by both.
+    Exact to 2⁻³² of the span of values: group and value are sorted as one integer.
     """
     found = np.full(count, np.nan)
     if not len(values):
@@ -204,7 +203,7 @@ def means(values: np.ndarray, groups: Groups, lasting_sd: float) -> Statistic:
 
 def _with_error(value: np.ndarray, step: np.ndarray, influence: np.ndarray, groups: Groups,
                 lasting_sd: float | None, is_bin: bool = False) -> Statistic:
-    """Add standard errors to a statistic (k,) of groups; NaN where a group is too small.
+    """Add standard errors to a statistic (k,) of groups; both NaN where a group is below `LEAST`.
 
     A sandwich over passing units, of the influence (m,) of members times `step` (k,), plus the
     error of lasting units in quadrature; `lasting_sd` None: values are independent. Bins have few
@@ -217,9 +216,9 @@ def _with_error(value: np.ndarray, step: np.ndarray, influence: np.ndarray, grou
     unit_influence = np.bincount(groups.passing_unit, influence, len(groups.of_passing_unit))
     squares = np.bincount(groups.of_passing_unit, unit_influence**2, count)
     sandwich = step * np.sqrt(squares * units / np.maximum(units - 1, 1))
-    share = np.bincount(groups.lasting_unit, minlength=len(groups.of_lasting_unit)).astype(float)
+    sizes = np.bincount(groups.lasting_unit, minlength=len(groups.of_lasting_unit)).astype(float)
     effective = np.maximum(
-        number**2 / np.maximum(np.bincount(groups.of_lasting_unit, share**2, count), 1), 1.0)
+        number**2 / np.maximum(np.bincount(groups.of_lasting_unit, sizes**2, count), 1), 1.0)
     independent = step * np.sqrt(np.bincount(groups.group, influence**2, count))
     least = BIN_LEAST if is_bin else LEAST
     enough = (number >= least[0]) & (units >= least[1]) & (effective >= least[2])

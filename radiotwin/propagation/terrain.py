@@ -54,7 +54,7 @@ class TerrainPaths(NamedTuple):
 
 
 def is_far(device_m: np.ndarray, receiver_m: np.ndarray) -> np.ndarray:
-    """Return (n,) bool: receiver and device (3,) [m] are over FAR_M apart, so Earth is curved."""
+    """Return (n,) bool: the receiver is more than FAR_M from the device (3,) [m], horizontally."""
     return np.hypot(*(receiver_m - device_m)[:, :2].T) > FAR_M
 
 

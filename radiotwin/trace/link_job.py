@@ -140,10 +140,10 @@ class PackedCity:
 
 
 def with_radius(scene: Scene, settings: SolverSettings) -> SolverSettings:
-    """Return settings with the default culling radius, `RADIUS_M`, if the city has many shapes.
+    """Return settings with the culling radius `RADIUS_M` in a city of over `MANY_SHAPES` meshes.
 
-    Geometry farther than the culling radius from the lines of sight is left out of tracing. Many
-    are more than `MANY_SHAPES` mesh files. A radius that is given stays; so does the solver `map`.
+    Geometry farther than the culling radius from the lines of sight is left out of tracing. A
+    radius that is given stays; so do settings of the solver `map`.
     """
     if settings.solver != "paths" or settings.radius_m is not None:
         return settings
@@ -243,7 +243,7 @@ class BatchStore:
 
     def put(self, piece: "LinkBatch", result: np.ndarray, messages: list[str],
             seconds: float) -> None:
-        """Save the gains of a batch, completely or not at all."""
+        """Save the gains of a batch, completely or not at all; messages and time are not kept."""
         with atomic_path(self.folder / f"{piece.name}.npy") as temporary:
             temporary.write_bytes(_file_content(result))
         note_finished()
@@ -283,7 +283,7 @@ class LinkBatch:
         return len(self.points_m)
 
     def halves(self) -> "tuple[LinkBatch, LinkBatch] | None":
-        """Split the batch into two that need half the memory; None if it has one point."""
+        """Split the batch into two of half the memory; None if it, or a call, has one point."""
         if len(self) < 2 or self.batch_receivers < 2:
             return None
         middle, step = (len(self) + 1) // 2, (self.batch_receivers + 1) // 2
@@ -386,7 +386,7 @@ def solve_lattice(scene: Scene, settings: SolverSettings, store: BatchStore, ind
     """Trace the links from devices to lattice positions; batches in the cache are not solved again.
 
     `columns` are indices of positions, None: all; `label` is a part of the batches' names. Returns
-    (devices, positions) gains [dB]; NaN where there is no path.
+    (devices, positions) gains [dB], NaN where there is no path, or `IMPOSSIBLE_DB`.
     """
     pieces, order = lattice_pieces(scene, settings, index, columns, label)
     job = link_job(scene, settings, description)
@@ -423,7 +423,7 @@ def sample_size(scene: Scene) -> int:
 
 
 def exchanged_calls(scene: Scene, settings: SolverSettings, devices: int) -> int:
-    """Return the maximum of solver calls in `solve_exchanged`: a tenth of the map's, 8 to 50."""
+    """Return the most calls of `solve_exchanged`: 10 % of the map's, 8 to 50; ≤ `sample_size`."""
     batches = devices * -(-len(scene.lattice.positions_m) // settings.batch_receivers)
     return min(sample_size(scene), max(MIN_EXCHANGED, min(MAX_EXCHANGED, batches // 10)))
 
@@ -450,9 +450,9 @@ def solve_exchanged(scene: Scene, settings: SolverSettings, store: BatchStore, i
         point_m = scene.lattice.positions_m[column]
         for devices in groups:
             digest = hashlib.sha256(str(devices).encode()).hexdigest()[:12]
-            ends_m = scene.device_m[devices]
-            tile = tile_of(point_m, ends_m, settings.radius_m, longest_m)
-            pieces.append(LinkBatch(f"exchanged-{column:07d}-{digest}", point_m, ends_m,
+            devices_m = scene.device_m[devices]
+            tile = tile_of(point_m, devices_m, settings.radius_m, longest_m)
+            pieces.append(LinkBatch(f"exchanged-{column:07d}-{digest}", point_m, devices_m,
                                     (scene.uav_antenna, scene.device_antennas[devices[0]]),
                                     settings.batch_receivers, tile))
     solved = executor.run(link_job(scene, settings, "exchanged ends"), pieces, store)

@@ -111,17 +111,17 @@ def _lengths_m(self: Any, paths: Any, source: Any, target: Any) -> Any:
 
     after, before = (drjit.zeros(mitsuba.Float, paths.buffer_size) for _ in range(2))
     bent = drjit.full(mitsuba.Bool, False, paths.buffer_size)
-    at = drjit.copy(source)
+    point = drjit.copy(source)
     for depth in range(1, paths.max_depth + 1):
         kind = paths.get_interaction_type(mitsuba.UInt(depth), True)
         is_used = kind != InteractionType.NONE
-        vertex = drjit.select(is_used, paths.get_vertex(mitsuba.UInt(depth), True), at)
-        leg = drjit.norm(vertex - at)
+        vertex = drjit.select(is_used, paths.get_vertex(mitsuba.UInt(depth), True), point)
+        leg = drjit.norm(vertex - point)
         after += drjit.select(bent, leg, 0.0)
         before += drjit.select(bent, 0.0, leg)
         bent |= kind == InteractionType.DIFFRACTION
-        at = vertex
-    leg = drjit.norm(target - at)
+        point = vertex
+    leg = drjit.norm(target - point)
     return (after + drjit.select(bent, leg, 0.0), before + drjit.select(bent, 0.0, leg))
 
 

@@ -126,7 +126,7 @@ def plan_trace(scene: Scene, settings: SolverSettings, devices: list[str] | None
         begun = time.perf_counter()
         found = Executor(pool).run(Job("calibrating", _Measured(job.function), job.resources, len),
                                    chosen)
-        taken_s = time.perf_counter() - begun
+        elapsed_s = time.perf_counter() - begun
         workers = max(min(LocalPool().room(job.resources), loky.cpu_count()), 1)
     finally:
         pool.close()
@@ -138,7 +138,7 @@ def plan_trace(scene: Scene, settings: SolverSettings, devices: list[str] | None
     return TracePlan(
         links=sum(map(len, pieces)), batches=len(pieces),
         finished=len(pieces) - len(missing) + count,
-        start_s=max(taken_s - walls_s.sum(), 0.0) / busy, batch_s=float(np.median(seconds)),
+        start_s=max(elapsed_s - walls_s.sum(), 0.0) / busy, batch_s=float(np.median(seconds)),
         batch_p90_s=float(np.quantile(seconds, 0.9)),
         busy=busy,
         peak_bytes=max((memory_bytes for *_, memory_bytes in found), default=0),
@@ -175,7 +175,7 @@ def choose_quality(scene: Scene, points_m: np.ndarray, target_db: float,
                    ) -> list[Rung]:
     """Find the quality with the fewest rays whose numerical error is within a target.
 
-    160 links between the devices and the points outdoors are drawn by the settings' seed. They are
+    Up to 160 links from devices to points outdoors are drawn by the settings' seed. They are
     solved with each quality, from the fewest rays on, and again with ten times its rays, until the
     RMS difference of detected links is within the target. `noise_floor_db` of a traced map is the
     same figure for 1 % of the map. In the context `keep_pieces`, each quality's gains are cached.
@@ -192,7 +192,7 @@ def choose_quality(scene: Scene, points_m: np.ndarray, target_db: float,
 
     Raises:
         BadInput: A target outside 0.05 to 20 dB, or that no quality reaches; an unknown device;
-            the solver `map`.
+            the solver `map`; all points inside buildings.
         RunFailed: Too few of the links are detected; no usable libLLVM.
     """
     low_db, high_db = TARGETS_DB
@@ -251,7 +251,7 @@ def _try_quality(scene: Scene, quality: str, settings: SolverSettings,
 
 def _solve_pilot(scene: Scene, settings: SolverSettings, calls: list[tuple[int, np.ndarray]]
                  ) -> np.ndarray:
-    """Return the sampled links' gains [dB] (NaN: not detected), and, last, the seconds per link."""
+    """Return the drawn links' gains (n + 1,) [dB], NaN: not detected; last the seconds per link."""
     solver = PathGains(scene.xml_path, scene.config.radio.frequency_hz, settings)
     gains, seconds = [], []
     for device, points_m in calls:

@@ -70,9 +70,9 @@ def check_gains(gain_db: np.ndarray, los: np.ndarray, distance_m: np.ndarray, fr
 
     With antennas, an LoS link is at least as strong as its direct path (`direct_dbi`, both
     antennas' gain along the straight line), and at most as if all paths left and arrived at the
-    antennas' peaks (`peak_dbi`, their sum). The median of LoS links over free space must lie within
-    `MEDIAN_EXCESS_DB`, and hardly any link below `MIN_EXCESS_DB`. RunFailed for a gain above 0 dB,
-    no path at all, or LoS links outside these bounds.
+    antennas' peaks (`peak_dbi`, their sum). If powers are added, the median of LoS links over free
+    space must lie within `MEDIAN_EXCESS_DB` and, with the solver `paths`, hardly any link below
+    `MIN_EXCESS_DB`. RunFailed for a gain above 0 dB, no path at all, or LoS links out of bounds.
     """
     found = np.isfinite(gain_db)
     if not found.any():
@@ -94,13 +94,13 @@ def check_gains(gain_db: np.ndarray, los: np.ndarray, distance_m: np.ndarray, fr
     dark_share = float(np.mean(excess_db < MIN_EXCESS_DB))
     figures |= {"los_excess_median_db": median_db, "los_excess_highest_db": highest_db,
                 "los_below_free_space_share": dark_share}
-    powers = combining == "power"
+    adds_powers = combining == "power"
     low_db, high_db = MEDIAN_EXCESS_DB
-    if powers and (median_db < low_db or np.median(peak_excess_db) > high_db):
+    if adds_powers and (median_db < low_db or np.median(peak_excess_db) > high_db):
         raise RunFailed(f"LoS links lie {median_db:+.1f} dB from free space in the median; "
                         f"{low_db:+.1f} to {high_db:+.1f} dB is possible: is city.xml in metres, "
                         "and its ground below the devices?")
-    if (solver == "paths" and powers and dark_share > MAX_DARK_SHARE
+    if (solver == "paths" and adds_powers and dark_share > MAX_DARK_SHARE
             and dark_share * len(excess_db) > MAX_DARK_LINKS):
         raise RunFailed(f"{100 * dark_share:.1f} % of the links that have LoS by the 3D map are "
                         f"weaker than free space, {100 * MAX_DARK_SHARE:.1f} % may be: the "
@@ -111,7 +111,8 @@ def check_gains(gain_db: np.ndarray, los: np.ndarray, distance_m: np.ndarray, fr
 def noise_figures(gain_db: np.ndarray, finer_db: np.ndarray) -> dict[str, float | str]:
     """Compare gains with those from ten times the rays, both (n,) [dB] with NaN where not detected.
 
-    Attributes of the map, over links detected in both; and the share of those detected in only one.
+    Returns attributes of the map, over links detected in both (none: NaN), and the share of all
+    links that are detected in only one.
     """
     both = np.isfinite(gain_db) & np.isfinite(finer_db)
     difference_db = np.abs(gain_db - finer_db)[both] if both.any() else np.array([np.nan])
@@ -188,7 +189,7 @@ def trace_map(scene: Scene | Path | str, settings: SolverSettings | None = None,
 
     Raises:
         BadInput: No device, an unknown one, a scene that cannot be read, or an output that cannot
-            be written.
+            be written; too many links; a lattice or antennas that the solver `map` cannot handle.
         RunFailed: No usable libLLVM, or gains that physics does not allow. Nothing is written then.
     """
     scene = Scene.of(scene)
@@ -271,9 +272,9 @@ def warn_of_terrain(city: CityMap, device_m: np.ndarray, positions_m: np.ndarray
     the horizon, all links longer than `FAR_M` count, as Sionna RT's Earth is flat.
     """
     hidden = far = 0
-    for point_m, missed in zip(device_m, no_path, strict=True):
+    for point_m, without_path in zip(device_m, no_path, strict=True):
         far += int((np.hypot(*(positions_m - point_m)[:, :2].T) > FAR_M).sum())
-        hidden += int(city.hidden_by_ground(point_m[None], positions_m[missed]).sum())
+        hidden += int(city.hidden_by_ground(point_m[None], positions_m[without_path]).sum())
     if hidden:
         warnings.warn(f"behind terrain lie {percent(hidden / no_path.size)} of the links, and no "
                       "path was found to them: Sionna RT diffracts once, so that what rounded "
@@ -287,7 +288,7 @@ def warn_of_terrain(city: CityMap, device_m: np.ndarray, positions_m: np.ndarray
 
 
 def _antenna_gains(scene: Scene, index: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return both antennas' gain along each link's line (devices, positions), and peaks [dBi]."""
+    """Return both antennas' gain along links (devices, positions), and peaks (devices, 1) [dBi]."""
     link_m = scene.lattice.positions_m[None] - scene.device_m[index][:, None]
     direct_dbi, peak_dbi = np.zeros(link_m.shape[:2]), np.zeros((len(index), 1))
     for row, antenna in enumerate(scene.device_antennas[device] for device in index):
@@ -314,10 +315,9 @@ def _finished_map(path: Path, trace_hash: str, devices: list[str]) -> RadioMap |
 
 
 def device_indices(scene: Scene, devices: list[str] | None) -> list[int]:
-    """Return the indices of named devices in `scene.config.devices`; None: of all.
+    """Return indices in `scene.config.devices` of named devices, each once; None or empty: of all.
 
-    Raises:
-        BadInput: The scene has no devices, or none of that name.
+    BadInput if the scene has no devices, or none of that name.
     """
     names = {device.device: index for index, device in enumerate(scene.config.devices)}
     if not names:
@@ -333,8 +333,7 @@ def device_indices(scene: Scene, devices: list[str] | None) -> list[int]:
 def open_store(scene: Scene, settings: SolverSettings) -> BatchStore:
     """Open the cache of finished batches for a scene's map with these settings, in its folder.
 
-    Raises:
-        BadInput: The folder lies outside the scene's, or cannot be written.
+    BadInput if the folder lies outside the scene's, or cannot be written.
     """
     lattice = {name: values.tolist() for name, values in asdict(scene.lattice).items()
                if values is not None}
@@ -346,15 +345,15 @@ def open_store(scene: Scene, settings: SolverSettings) -> BatchStore:
 def _censor_gains(raw_db: np.ndarray, inside: np.ndarray, impossible: np.ndarray, limit_db: float
                   ) -> tuple[np.ndarray, dict[str, int]]:
     """Set gains (devices, positions) not detected to NaN, and count the links by reason."""
-    within = np.broadcast_to(inside, raw_db.shape)
-    no_path = np.isnan(raw_db) & ~within & ~impossible
-    below = ~within & (raw_db < limit_db)
-    gain_db = np.where(within | below, np.nan, raw_db)
+    is_inside = np.broadcast_to(inside, raw_db.shape)
+    no_path = np.isnan(raw_db) & ~is_inside & ~impossible
+    below_limit = ~is_inside & (raw_db < limit_db)
+    gain_db = np.where(is_inside | below_limit, np.nan, raw_db)
     return gain_db, {
         "links_detected": int(np.isfinite(gain_db).sum()),
         "links_without_path": int(no_path.sum()),
-        "links_below_sensitivity": int(below.sum()),
-        "links_inside_building": int(within.sum()),
+        "links_below_sensitivity": int(below_limit.sum()),
+        "links_inside_building": int(is_inside.sum()),
         "links_impossible": int(impossible.sum()),
     }
 

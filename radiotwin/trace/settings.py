@@ -111,14 +111,9 @@ class SolverSettings:
 
     @classmethod
     def of_quality(cls, quality: str = "default", **others: Any) -> "SolverSettings":
-        """Return the settings of a quality; the solver `map` gets 100 times its rays.
+        """Return the settings of one of QUALITIES; the solver `map` gets 100 times its rays.
 
-        Args:
-            quality: `fast`, `default` or `high`.
-            others: Fields that differ from it.
-
-        Raises:
-            BadInput: No such quality.
+        `others` are fields that differ from it. BadInput if there is no such quality.
         """
         if quality not in QUALITIES:
             raise BadInput(f"quality {quality!r} is unknown; allowed are {', '.join(QUALITIES)}")
@@ -128,7 +123,7 @@ class SolverSettings:
         return cls(**(settings | others))
 
     def finer(self, factor: int) -> "SolverSettings":
-        """Return the same settings with `factor` times the rays, in the same memory."""
+        """Return settings with `factor` times the rays, for that many times fewer receivers."""
         return replace(self, samples_per_src=factor * self.samples_per_src,
                        batch_receivers=max(1, self.batch_receivers // factor))
 
@@ -142,7 +137,8 @@ class SolverSettings:
     def attributes(self) -> dict[str, Any]:
         """Return everything that a gain depends on, as attributes of a NetCDF file.
 
-        `compute_device` is left out for processors: their maps are the same on every machine.
+        `compute_device` is left out for processors: their maps are the same on every machine; so is
+        `radius_m` if the whole city is traced.
         `wedge` (the model of edges) is only there for `reciprocal`: a map with `diffraction` 1 and
         no `wedge` has Sionna RT's own. NetCDF has no booleans: they are 0 and 1.
         """

@@ -175,7 +175,7 @@ def candidate_search(table_size: int, diffraction_probability: float) -> Iterato
 
 def distinct_paths(interactions: np.ndarray, vertices_m: np.ndarray, length_m: np.ndarray,
                    strength: np.ndarray, cos_turn: np.ndarray) -> np.ndarray:
-    """Return which paths of each link count (n, k), each distinct path once.
+    """Return which paths of each link count, (n, k) bool, each distinct path once.
 
     Paths are duplicates if they have the same interactions (depth, n, k), 0: none, in the same
     order at the same points (depth, n, k, 3), and the same length: the strongest counts. Paths of
@@ -187,10 +187,10 @@ def distinct_paths(interactions: np.ndarray, vertices_m: np.ndarray, length_m: n
     exists = length_m > 0
     used = interactions > 0
     direct = exists & ~used.any(axis=0)
-    keep = exists & ~direct
+    counts = exists & ~direct
     straightest = np.where(direct, cos_turn, np.inf).argmin(axis=1) if direct.any() else 0
     links = np.flatnonzero(direct.any(axis=1))  # the straightest of their direct paths counts
-    keep[links, np.broadcast_to(straightest, len(direct))[links]] = True
+    counts[links, np.broadcast_to(straightest, len(direct))[links]] = True
 
     link, path = np.nonzero(exists & ~direct)
     types = np.ascontiguousarray(interactions[:, link, path].T)
@@ -201,11 +201,11 @@ def distinct_paths(interactions: np.ndarray, vertices_m: np.ndarray, length_m: n
     point_m = np.where(used[..., None], vertices_m, 0.0)
     # Sorted by length: duplicates are neighbours, or a few places apart
     for shift in range(1, len(link)):
-        near = ((link[shift:] == link[:-shift]) & (kind[shift:] == kind[:-shift])
-                & (length[shift:] - length[:-shift] <= _LENGTH_TOLERANCE * length[shift:]))
-        if not near.any():  # nor at a larger shift, as lengths rise within a link and kind
+        similar = ((link[shift:] == link[:-shift]) & (kind[shift:] == kind[:-shift])
+                   & (length[shift:] - length[:-shift] <= _LENGTH_TOLERANCE * length[shift:]))
+        if not similar.any():  # nor at a larger shift, as lengths rise within a link and kind
             break
-        first = np.flatnonzero(near)
+        first = np.flatnonzero(similar)
         second = first + shift
         apart_m = np.abs(point_m[:, link[first], path[first]]
                          - point_m[:, link[second], path[second]])
@@ -213,8 +213,8 @@ def distinct_paths(interactions: np.ndarray, vertices_m: np.ndarray, length_m: n
         first, second = first[same], second[same]
         stronger = strength[link[first], path[first]] >= strength[link[second], path[second]]
         weaker = np.where(stronger, second, first)
-        keep[link[weaker], path[weaker]] = False
-    return keep
+        counts[link[weaker], path[weaker]] = False
+    return counts
 
 
 class PathGains:
@@ -376,7 +376,7 @@ class CellGains:
 
 
 def power_to_db(power: np.ndarray) -> np.ndarray:
-    """Return a power ratio in dB, NaN where it is zero."""
+    """Return power ratios (any shape) in dB, NaN where they are zero."""
     with np.errstate(divide="ignore"):
         return np.where(power > 0, 10 * np.log10(power), np.nan)
 

@@ -185,7 +185,7 @@ def ground_blocks(links: LinkGeometry) -> np.ndarray:
 
 
 def require_names(what: str, given: Collection[str], expected: Collection[str]) -> None:
-    """Raise ValueError unless the given names, of a kind `what`, are exactly the expected ones."""
+    """Raise ValueError, with `what` in front, unless the names are exactly the expected ones."""
     wrong = sorted(set(given) ^ set(expected))
     if wrong:
         state = "missing" if wrong[0] in expected else "unknown"

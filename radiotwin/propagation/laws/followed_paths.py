@@ -160,9 +160,9 @@ class Rays:
                            mean_gain: float = 1.0) -> np.ndarray:
         """Return what an antenna adds to the levels (n,) [dB]; NaN for links without power.
 
-        `gain` (p,) is that in the directions of the rays, linear; `scattered_db` the power
-        scattered from all directions, relative to free space, with the mean gain over all
-        directions.
+        `gain` (p,) is that in the directions of the rays, linear; `scattered_db` the power that
+        arrives scattered from all directions, relative to free space, and is received with
+        `mean_gain`, linear.
         """
         scattered = self.free_space * 10 ** (scattered_db / 10)
         received = self._sums(self.power * gain) + scattered * mean_gain

@@ -275,7 +275,7 @@ def paths_db(links: LinkGeometry, diffuse: tuple[float, float], offsets_db: Offs
 
 
 def moved(links: LinkGeometry, east_m: float, north_m: float) -> LinkGeometry:
-    """Move both ends of links over their map [m], and look up the line of sight again."""
+    """Move both ends of links over their map [m]; without a map, line of sight stays as it is."""
     step_m = np.array([east_m, north_m, 0.0])
     device_m, receiver_m = links.device_m + step_m, links.receiver_m + step_m
     los = links.los if links.city is None else links.city.line_of_sight(device_m, receiver_m)

@@ -198,16 +198,16 @@ class ResidualField:
         groups = [rows]
         while groups:
             group = groups.pop()
-            low_m, high_m = position_m[group].min(axis=0), position_m[group].max(axis=0)
-            distance_m, near = tree.query((low_m + high_m) / 2, LOCAL_POINTS)
-            radius_m = np.linalg.norm(high_m - low_m) / 2
+            least_m, greatest_m = position_m[group].min(axis=0), position_m[group].max(axis=0)
+            distance_m, nearest_rows = tree.query((least_m + greatest_m) / 2, LOCAL_POINTS)
+            radius_m = np.linalg.norm(greatest_m - least_m) / 2
             if len(group) > 1 and radius_m > 0 and (
                     len(group) > LOCAL_ROWS or radius_m > LOCAL_SPREAD * distance_m[-1]):
-                longest = (high_m - low_m).argmax()
+                longest = (greatest_m - least_m).argmax()
                 order = group[np.argsort(position_m[group, longest], kind="stable")]
                 groups += [order[:len(group) // 2], order[len(group) // 2:]]
                 continue
-            nearest = field.select(near)
+            nearest = field.select(nearest_rows)
             yield nearest, self._solve(nearest), group
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

@@ -93,21 +93,21 @@ class SegmentedLogDistance(ChannelModel):
             for name, rows in (("los", links.los), ("nlos", ~links.los))
         }
         detected = {name: int(np.isfinite(level).sum()) for name, (_, level, _) in data.items()}
-        poor, rich = sorted(detected, key=lambda name: detected[name])
-        lines = {rich: fit_line(*data[rich])}
-        self.borrowed = poor if detected[poor] < MIN_DETECTED else None
+        few, many = sorted(detected, key=lambda name: detected[name])
+        lines = {many: fit_line(*data[many])}
+        self.borrowed = few if detected[few] < MIN_DETECTED else None
         if self.borrowed is None:
-            lines[poor] = fit_line(*data[poor])
+            lines[few] = fit_line(*data[few])
         else:
-            wide = replace(lines[rich], sd_db=max(lines[rich].sd_db, BORROWED_SD_DB))
-            prior_db = NLOS_LOSS_DB if poor == "los" else -NLOS_LOSS_DB
-            lines[poor] = shift_line(wide, *data[poor], prior_db, NLOS_LOSS_SD_DB)
-            shift_db = lines[poor].intercept_db - lines[rich].intercept_db
+            widened = replace(lines[many], sd_db=max(lines[many].sd_db, BORROWED_SD_DB))
+            prior_db = NLOS_LOSS_DB if few == "los" else -NLOS_LOSS_DB
+            lines[few] = shift_line(widened, *data[few], prior_db, NLOS_LOSS_SD_DB)
+            shift_db = lines[few].intercept_db - lines[many].intercept_db
             labels = {"los": "LoS", "nlos": "NLoS"}
             warnings.warn(
-                f"only {detected[poor]} detected {labels[poor]} links (wanted: {MIN_DETECTED}), so "
-                f"the {labels[poor]} channel is the {labels[rich]} one moved by {shift_db:+.1f} "
-                f"dB, mostly a guess: measure more {labels[poor]} links before relying on it",
+                f"only {detected[few]} detected {labels[few]} links (wanted: {MIN_DETECTED}), so "
+                f"the {labels[few]} channel is the {labels[many]} one moved by {shift_db:+.1f} "
+                f"dB, mostly a guess: measure more {labels[few]} links before relying on it",
                 stacklevel=2)
         self.los, self.nlos = lines["los"], lines["nlos"]
         return self

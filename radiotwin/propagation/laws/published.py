@@ -269,7 +269,11 @@ class WalfischIkegami(PublishedLaw):
 
     @override
     def branch(self, links: LinkGeometry, los: bool) -> Branch:
-        """Return the loss along a street (LoS) or over roofs (NLoS), and its sd [dB]."""
+        """Return the loss along a street (LoS) or over roofs (NLoS), and its sd [dB].
+
+        Free space in LoS nearer than LOS_M. At least free space in NLoS, with the heights of the
+        ends clipped to BASE_M and MOBILE_M.
+        """
         free_db = free_space_db(links.distance_m, self.frequency_hz)
         if los:
             street_db = (42.6 + 26 * np.log10(links.distance_m / 1e3)

@@ -90,7 +90,7 @@ def follow_rays(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, fre
                 depth: int = 4) -> Iterator[tuple[Rays, int]]:
     """Find paths of up to `depth` interactions from a device (3,) to receivers (n, 3) [m].
 
-    Paths along terrain are included, see `radiotwin.propagation.paths.powers.PathPowers`.
+    As `radiotwin.propagation.paths.powers.PathPowers`, but without diffraction at two edges.
 
     Yields:
         The paths to the next chunk of receivers, with rows of all receivers, and the chunk's size.
