@@ -49,7 +49,7 @@ class Pattern:
     def at(self, azimuth_deg: ArrayLike, elevation_deg: ArrayLike) -> np.ndarray:
         """Interpolate the gain [dBi], bilinear in dB and periodic in azimuth.
 
-        Azimuths are clockwise from the boresight, elevations above zero upwards; they broadcast.
+        Azimuths are clockwise from the boresight. Elevations, upwards, are clipped to the grid's.
         """
         # The first column is repeated at the end: 359.5 degrees lies between the last and the first
         azimuths = np.append(self.azimuth_deg, self.azimuth_deg[0] + 360)
@@ -72,8 +72,8 @@ class Pattern:
             # Between two azimuths the gain is linear in dB: its mean power is the logarithmic mean
             # of the powers at both ends
             rise = np.diff(self.gain_dbi, append=self.gain_dbi[:, :1]) * np.log(10) / 10
-            level = np.abs(rise) < 1e-9
-            power = power * np.where(level, 1.0, np.expm1(rise) / np.where(level, 1.0, rise))
+            is_flat = np.abs(rise) < 1e-9
+            power = power * np.where(is_flat, 1.0, np.expm1(rise) / np.where(is_flat, 1.0, rise))
         mean_dbi = 10 * np.log10(power @ gaps_deg / 360)
         return Pattern(np.array([0.0]), self.elevation_deg, mean_dbi[:, None])
 
@@ -84,8 +84,8 @@ def _bracket(grid: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarr
     Values beyond the grid are clipped to its ends.
     """
     index = np.clip(np.searchsorted(grid, values, side="right") - 1, 0, len(grid) - 2)
-    held = np.clip(values, grid[0], grid[-1])
-    return index, (held - grid[index]) / (grid[index + 1] - grid[index])
+    clipped = np.clip(values, grid[0], grid[-1])
+    return index, (clipped - grid[index]) / (grid[index + 1] - grid[index])
 
 
 @dataclass(frozen=True, eq=False)

@@ -209,7 +209,7 @@ class CityMap:
         return los
 
     def hidden_by_ground(self, a_m: np.ndarray, b_m: np.ndarray) -> np.ndarray:
-        """Return whether the terrain blocks the line of sight; arguments as for `line_of_sight`."""
+        """Return whether terrain, if any, blocks the sight; arguments as for `line_of_sight`."""
         if self.terrain is None:
             return np.zeros(np.broadcast_shapes(np.shape(a_m), np.shape(b_m))[:-1], dtype=bool)
         return ~self.ground.line_of_sight(a_m, b_m)
@@ -280,18 +280,18 @@ class CityMap:
         # A ray that meets a corner or an edge exactly may pass between triangles: then it is cast
         # again a little beside
         for aside_m in (0.0, 0.004, 0.03, 0.2):
-            left = np.flatnonzero(np.isnan(height_m))
-            if not len(left):
+            missing = np.flatnonzero(np.isnan(height_m))
+            if not len(missing):
                 break
             above = np.column_stack([
-                np.clip(points_m[left] + aside_m * np.array([0.8, 0.6]), low_m + SKIN_M,
-                        high_m - SKIN_M), np.full(len(left), ground._top_m)])
+                np.clip(points_m[missing] + aside_m * np.array([0.8, 0.6]), low_m + SKIN_M,
+                        high_m - SKIN_M), np.full(len(missing), ground._top_m)])
             far_m = ground.first_hits_towards(above, DOWN)[0]
-            height_m[left] = np.where(np.isfinite(far_m), ground._top_m - far_m, np.nan)
-        left = np.flatnonzero(np.isnan(height_m))  # in a hole: terrain of another program
-        if len(left):
-            corner = cKDTree(ground.vertices[:, :2]).query(points_m[left])[1]
-            height_m[left] = ground.vertices[corner, 2]
+            height_m[missing] = np.where(np.isfinite(far_m), ground._top_m - far_m, np.nan)
+        missing = np.flatnonzero(np.isnan(height_m))  # in a hole: terrain of another program
+        if len(missing):
+            corner = cKDTree(ground.vertices[:, :2]).query(points_m[missing])[1]
+            height_m[missing] = ground.vertices[corner, 2]
         return height_m
 
     def below_ground(self, points_m: np.ndarray) -> np.ndarray:
@@ -360,9 +360,9 @@ class CityMap:
 
     def _crossings(self, a_m: np.ndarray, b_m: np.ndarray
                    ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Yield where segments (a, b) first cross a surface, then where they next do, and so on.
+        """Yield first crossings of segments (a, b) with surfaces, then second ones, and so on.
 
-        Of those that do: distance from a [m], +1 (entering) or -1 (leaving a solid), and index.
+        Of each: distance from a [m], +1 (entering) or -1 (leaving a solid), index of the segment.
         """
         ray = np.arange(len(a_m))
         length = np.linalg.norm(b_m - a_m, axis=1)
@@ -370,13 +370,13 @@ class CityMap:
         travelled = np.zeros(len(a_m))
         while len(ray):
             origin = a_m[ray] + travelled[ray, None] * direction[ray]
-            distance, face, cosine = self.first_hits(origin, b_m[ray])
+            distance, face, facing = self.first_hits(origin, b_m[ray])
             hit = face >= 0
             ray = ray[hit]
-            at = travelled[ray] + distance[hit]
+            along_m = travelled[ray] + distance[hit]
             if len(ray):
-                yield at, np.where(cosine[hit] < 0, 1, -1), ray
-            travelled[ray] = at + SKIN_M
+                yield along_m, np.where(facing[hit] < 0, 1, -1), ray
+            travelled[ray] = along_m + SKIN_M
             ray = ray[travelled[ray] < length[ray]]
 
     def first_hits(self, a_m: np.ndarray, b_m: np.ndarray
@@ -389,7 +389,7 @@ class CityMap:
 
         Returns:
             (n,) distance from a [m] (infinite: none), (n,) face (-1: none), and (n,) direction
-            times normal, negative where the ray enters a solid.
+            times a normal of any length, negative where the ray enters a solid.
         """
         a_m, b_m = np.asarray(a_m, dtype=float), np.asarray(b_m, dtype=float)
         offset = b_m - a_m
@@ -409,7 +409,7 @@ class CityMap:
         n = len(start_m)
         direction = np.broadcast_to(direction, (n, 3))
         length_m = np.broadcast_to(length_m, n)
-        distance, face, cosine = np.full(n, np.inf), np.full(n, -1), np.zeros(n)
+        distance, face, facing = np.full(n, np.inf), np.full(n, -1), np.zeros(n)
         for start in range(0, n, CHUNK):
             part = slice(start, start + CHUNK)
             towards = np.ascontiguousarray(direction[part], dtype=np.float32)
@@ -419,8 +419,8 @@ class CityMap:
             hit = np.flatnonzero(found["primID"] >= 0)
             face[start + hit] = faces = self._drawn[found["primID"][hit]]
             distance[start + hit] = found["tfar"][hit]
-            cosine[start + hit] = np.einsum("ij,ij->i", towards[hit], self._normals[faces])
-        return distance, face, cosine
+            facing[start + hit] = np.einsum("ij,ij->i", towards[hit], self._normals[faces])
+        return distance, face, facing
 
 
 def building_of_vertex(city: CityMap) -> np.ndarray:
@@ -482,7 +482,7 @@ def shape_height_sds_m(folder: Path) -> dict[str, float] | None:
     """Read the standard deviation of the height of each shape [m] from a folder's `buildings.csv`.
 
     A shape is a block of buildings that touch: the mean over its buildings is weighted by area.
-    None if the folder has no such table, or the table no column `height_sd_m`.
+    None without such a table, or without its columns `shape`, `area_m2` and `height_sd_m`.
 
     Raises:
         BadInput: the table cannot be read, lies outside the folder, or has an impossible value.

@@ -62,7 +62,7 @@ def moved_outdoors(city: CityMap, points_m: np.ndarray) -> np.ndarray:
 
 
 def _above_surface(city: CityMap, point_m: np.ndarray, to_ground: bool) -> Footing | None:
-    """Return the position just above the ground (else the roof); None if below, or indoors."""
+    """Return the position above the ground (or roof); None if under the device, or indoors."""
     x_m, y_m, z_m = point_m.tolist()
     ground_m = float(city.ground_height_m(x_m, y_m))
     surface_m, sd_m, what = ground_m, GROUND_SD_M, "the ground"
@@ -101,9 +101,9 @@ def _beside_wall(city: CityMap, point_m: np.ndarray) -> Footing | None:
     if not free.any():
         return None
     nearest = int(free.any(axis=1).argmax())
-    wall_m, ways = float(steps_m[nearest]), towards[free[nearest]]
-    across = ways.sum(axis=0) / max(np.linalg.norm(ways.sum(axis=0)), 1e-9)
-    for direction in (across, ways[0]):  # between two walls their mean may point along both
+    wall_m, outward = float(steps_m[nearest]), towards[free[nearest]]
+    across = outward.sum(axis=0) / max(np.linalg.norm(outward.sum(axis=0)), 1e-9)
+    for direction in (across, outward[0]):  # between two walls their mean may point along both
         outside_m = point_m + (wall_m + CLEARANCE_M) * direction
         if not city.inside(outside_m)[0]:
             break

@@ -60,9 +60,9 @@ class BuiltGrid:
             return cls(x_m, y_m, np.zeros((len(y_m), len(x_m)), dtype=bool))
         x, y = np.meshgrid(x_m, y_m)
         z = buildings.vertices[:, 2]
-        low = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, z.max() + 1.0)])
-        high = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, z.min() - 1.0)])
-        return cls(x_m, y_m, ~buildings.line_of_sight(low, high).reshape(x.shape))
+        above = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, z.max() + 1.0)])
+        below = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, z.min() - 1.0)])
+        return cls(x_m, y_m, ~buildings.line_of_sight(above, below).reshape(x.shape))
 
     @property
     def cell_m(self) -> float:
@@ -79,7 +79,7 @@ class BuiltGrid:
         return distance_transform_edt(np.pad(~self.built, 1))[1:-1, 1:-1] * self.cell_m
 
     def density(self) -> np.ndarray:
-        """Return the (ny, nx) share under buildings of the 200 m square around each cell."""
+        """Return the (ny, nx) built share of 200 m squares around cells; none beyond the extent."""
         return uniform_filter(self.built.astype(np.float32), size=int(200.0 / self.cell_m),
                               mode="constant")
 
@@ -117,8 +117,8 @@ def building_tops(surfaces: Surfaces, solid: np.ndarray, ground: CityMap | None
     area = np.maximum(np.bincount(surfaces.shape, weight, surfaces.shapes), 1e-12)
     x_m, y_m = (np.bincount(surfaces.shape, weight * surfaces.centres[:, axis], surfaces.shapes)
                 / area for axis in (0, 1))
-    below_m = np.zeros(surfaces.shapes) if ground is None else _height_m(ground, x_m, y_m)
-    return tops_m, np.where(tops_m > 0, np.maximum(tops_m - below_m, 0.0), 0.0)
+    ground_m = np.zeros(surfaces.shapes) if ground is None else _height_m(ground, x_m, y_m)
+    return tops_m, np.where(tops_m > 0, np.maximum(tops_m - ground_m, 0.0), 0.0)
 
 
 def _height_m(ground: CityMap, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
@@ -198,12 +198,12 @@ def place_devices(count: int, grid: BuiltGrid, ground: CityMap | None, rng: np.r
                     break
         apart_m *= 0.8
     positions = np.round(chosen, 1)
-    bottom_m = np.zeros(count) if ground is None else _height_m(ground, *positions.T)
+    ground_m = np.zeros(count) if ground is None else _height_m(ground, *positions.T)
     anchors = _spread_out(positions, min(count, max(3, round(0.3 * count))))
     return [DeviceConfig(device=f"device{number + 1:02d}", x_m=float(x), y_m=float(y),
-                         z_m=round(float(bottom) + ANTENNA_HEIGHT_M, 2),
+                         z_m=round(float(base_m) + ANTENNA_HEIGHT_M, 2),
                          role="anchor" if number in anchors else "unknown")
-            for number, ((x, y), bottom) in enumerate(zip(positions, bottom_m))]
+            for number, ((x, y), base_m) in enumerate(zip(positions, ground_m))]
 
 
 def _spread_out(positions: np.ndarray, count: int) -> set[int]:

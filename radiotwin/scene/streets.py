@@ -72,7 +72,7 @@ def write_streets(lines_m: Sequence[np.ndarray], origin: Origin, folder: Path) -
 
 
 def read_streets(folder: Path, origin: Origin | None) -> list[np.ndarray]:
-    """Read the streets (n, 2) of a scene folder in its local frame [m]; [] if it has none.
+    """Read the streets (n, 2) of a scene folder [m]; [] without such a file or an origin.
 
     Raises:
         BadInput: a damaged file, or one that leads out of the folder.

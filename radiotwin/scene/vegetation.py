@@ -101,7 +101,7 @@ class Vegetation:
 
     def metres_through(self, a_m: np.ndarray, b_m: np.ndarray,
                        ground: GroundHeight | None = None) -> np.ndarray:
-        """Return the length that straight links run through vegetation.
+        """Return the length of straight links inside vegetation, above the ground.
 
         Args:
             a_m: (n, 3) one end of each link [m].
@@ -150,10 +150,10 @@ class Vegetation:
             first = np.cumsum(samples[part]) - samples[part]
             share = (np.arange(len(row)) - np.repeat(first, samples[part]) + 0.5) / samples[row]
             link = links[row]
-            at_m = a_m[link] + share[:, None] * (b_m[link] - a_m[link])
-            above_m = at_m[:, 2] - ground(at_m[:, 0], at_m[:, 1])
+            sample_m = a_m[link] + share[:, None] * (b_m[link] - a_m[link])
+            above_m = sample_m[:, 2] - ground(sample_m[:, 0], sample_m[:, 1])
             low = np.flatnonzero((above_m >= 0) & (above_m <= self.height_m.max()))
-            point, area = tree.query(shapely.points(at_m[low, :2]), predicate="intersects")
+            point, area = tree.query(shapely.points(sample_m[low, :2]), predicate="intersects")
             inside = above_m[low[point]] <= self.height_m[area]
             hit = np.unique(low[point[inside]])  # on the border of two areas: once
             np.add.at(through_m, link[hit], (length_m[links] / samples)[row[hit]])

@@ -126,9 +126,9 @@ def _placed_model(prism: Prism) -> Manifold:
                             for polygon in shapely.get_parts(prism.area))])
 
 
-def _extruded(area: shapely.Polygon, bottom_m: float, top_m: float) -> Manifold:
-    """Return the solid over an area [m] with vertical walls, between two heights."""
-    rings = [shapely.get_coordinates(ring) for ring in (area.exterior, *area.interiors)]
+def _extruded(footprint: shapely.Polygon, bottom_m: float, top_m: float) -> Manifold:
+    """Return the prism on a footprint between two heights [m]; BadInput if impossible."""
+    rings = [shapely.get_coordinates(ring) for ring in (footprint.exterior, *footprint.interiors)]
     points, ends = np.concatenate(rings), np.cumsum([len(ring) for ring in rings])
     roof: np.ndarray = mapbox_earcut.triangulate_float64(points, ends).reshape(-1, 3)
     corner = np.arange(len(points))

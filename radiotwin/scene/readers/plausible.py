@@ -47,7 +47,8 @@ def implausible_heights(buildings: Sequence[tuple[str, Height, BaseGeometry]],
     above `MAX_MEDIAN_M` or below the height of a room.
 
     Args:
-        buildings: name, height and footprint in the local frame [m]; default heights are skipped.
+        buildings: name, height, footprint in the local frame [m]; of a name only the tallest part
+            counts, and default heights do not.
         columns: name of a building -> its tags.
     """
     tallest: dict[str, tuple[str, Height, BaseGeometry]] = {}
@@ -67,12 +68,12 @@ def implausible_heights(buildings: Sequence[tuple[str, Height, BaseGeometry]],
                        for footprint, top_m, low_m in zip(footprints, tops_m, least_m)])
     rare = (tops_m > RARE_M) | (tops_m > RARE_SLENDERNESS * np.maximum(wide_m, 1.0))
     median_m = float(np.median(tops_m)) if len(tops_m) > 1 else ROOM_M
-    shifted = median_m > MAX_MEDIAN_M
+    is_tall = median_m > MAX_MEDIAN_M
     if median_m < ROOM_M:
         return problems_of([f"{name}: {height.top_m:.3g} m" for name, height, _ in known],
                            f"building(s) have a median height of {median_m:.3g} m, less than a "
                            "room has. If a column counts storeys, say --height-column NAME:storeys")
-    if not (rare.any() or shifted):
+    if not (rare.any() or is_tall):
         return []
     named = np.flatnonzero(rare if rare.any() else tops_m > MAX_MEDIAN_M)
     examples = [f"{known[row][0]}: {tops_m[row]:.4g} m tall, {_width_m(footprints[row]):.3g} m wide"
@@ -135,9 +136,9 @@ def zero_voids(height_m: np.ndarray, pixel_m: float) -> np.ndarray:
     borders, walls = np.zeros(count + 1), np.zeros(count + 1)
     for inner, outer in _NEIGHBOURS:
         beside = (region[inner] > 0) & (region[outer] == 0) & np.isfinite(height_m[outer])
-        at = region[inner][beside]
-        borders += np.bincount(at, minlength=count + 1)
-        walls += np.bincount(at, height_m[outer][beside] > wall_m, minlength=count + 1)
+        bordered = region[inner][beside]
+        borders += np.bincount(bordered, minlength=count + 1)
+        walls += np.bincount(bordered, height_m[outer][beside] > wall_m, minlength=count + 1)
     void = ((borders > 0) & (walls >= VOID_BORDER * borders))[region]
     for _ in range(KERNEL_PIXELS if void.any() else 0):
         rim = ndimage.binary_dilation(void, _AROUND) & ~void

@@ -284,7 +284,7 @@ def _polygons(shape: Any) -> BaseGeometry | None:
     """Return the polygons of a shape: rings that turn as its largest are outlines, others holes.
 
     Outlines run clockwise [1], but some writers reverse all rings. A hole goes to the smallest
-    outline around it.
+    outline around it, or is dropped.
     """
     parts = _parts(shape)
     if sum(map(len, parts)) > OUTLINE_CORNERS.limit:  # refused later, if it is in the box

@@ -259,7 +259,7 @@ def _resolve_parts(
 
 
 def _inherit_tags(part: Feature, building: Feature) -> Feature:
-    """Return a part with its building's tags, without its bottom and those of another height."""
+    """Return a part with its building's tags, except bottom and replaced heights."""
     tags = {key: value for key, value in building.tags.items()
             if key not in ("min_height", "building:min_level")}
     known = [column.name for column in KNOWN]
@@ -309,8 +309,8 @@ def _touching_pairs(prisms: Sequence[Prism], areas: Any) -> np.ndarray:
     for start in range(0, len(areas), _CHUNK):
         a, b = tree.query(areas[start:start + _CHUNK], predicate="intersects")
         a = a + start
-        slack_m = np.minimum(top_m[a], top_m[b]) - np.maximum(bottom_m[a], bottom_m[b])
-        kept = (a < b) & (slack_m > -GRID_M)
+        common_m = np.minimum(top_m[a], top_m[b]) - np.maximum(bottom_m[a], bottom_m[b])
+        kept = (a < b) & (common_m > -GRID_M)
         parts.append(np.stack([a[kept], b[kept]], axis=1))
         found += int(corners[parts[-1]].sum())
         TOUCHING_CORNERS.check(found, "the map")

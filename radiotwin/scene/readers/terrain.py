@@ -156,10 +156,10 @@ def _errors(mesh: Delaunay, node: np.ndarray, z_m: np.ndarray,
     """Return the triangle that each node (n,) lies in, and its vertical distance from that [m]."""
     triangle = mesh.find_simplex(node)
     affine = mesh.transform[triangle]
-    share = np.einsum("nij,nj->ni", affine[:, :2], node - affine[:, 2])
-    share = np.column_stack([share, 1 - share.sum(axis=1)])
-    at_m = np.einsum("ni,ni->n", share, z_m[chosen][mesh.simplices[triangle]])
-    error_m = np.nan_to_num(np.abs(at_m - z_m))  # NaN: in a triangle without area on the border
+    weight = np.einsum("nij,nj->ni", affine[:, :2], node - affine[:, 2])
+    weight = np.column_stack([weight, 1 - weight.sum(axis=1)])
+    surface_m = np.einsum("ni,ni->n", weight, z_m[chosen][mesh.simplices[triangle]])
+    error_m = np.nan_to_num(np.abs(surface_m - z_m))  # NaN: in a triangle without area, at a border
     error_m[chosen] = 0.0
     return triangle, error_m
 
@@ -206,11 +206,11 @@ def read_heights(path: Path, origin: Origin, box_m: Bounds, unit: str | None = N
     height[wrong] = np.nan
     step_m, steps = steep_steps(height, every * pixel_m)
     known = np.isfinite(height)
-    at = [(row - first[0]) / every - 0.5, (column - first[1]) / every - 0.5]
+    position = [(row - first[0]) / every - 0.5, (column - first[1]) / every - 0.5]
     nearest = [np.clip(np.round(axis), 0, size - 1).astype(int)
-               for axis, size in zip(at, height.shape)]
-    covered = (known[tuple(nearest)] & (np.abs(at[0] - nearest[0]) <= 0.51)
-               & (np.abs(at[1] - nearest[1]) <= 0.51))
+               for axis, size in zip(position, height.shape)]
+    covered = (known[tuple(nearest)] & (np.abs(position[0] - nearest[0]) <= 0.51)
+               & (np.abs(position[1] - nearest[1]) <= 0.51))
     if not covered.mean() >= MIN_KNOWN:
         x_min, x_max, y_min, y_max = box_m
         west, south = (float(value) for value in to_geographic(origin, x_min, y_min))
@@ -222,7 +222,7 @@ def read_heights(path: Path, origin: Origin, box_m: Bounds, unit: str | None = N
     if not known.all():
         height = height[tuple(distance_transform_edt(~known, return_distances=False,
                                                      return_indices=True))]
-    heights_m = map_coordinates(height, at, order=1, mode="nearest")
+    heights_m = map_coordinates(height, position, order=1, mode="nearest")
     notes = []
     if wrong.any():
         notes.append(f"{np.count_nonzero(wrong):,} pixel(s) are no heights on land "
@@ -485,7 +485,7 @@ def raise_to_terrain(prisms: Sequence[Prism], ground: Ground) -> list[Prism]:
     footprints = {id(footprint): footprint for footprint in (
         prism.building_footprint or prism.area for prism in prisms)}
     lowest_m = dict(zip(footprints, _lowest_ground_m(list(footprints.values()), ground).tolist()))
-    stood = []
+    raised = []
     for prism in prisms:
         low_m, height = round(lowest_m[id(prism.building_footprint or prism.area)], 3), prism.height
         bottom_m = low_m + height.bottom_m if height.bottom_m > 0 else low_m - SKIRT_M
@@ -493,9 +493,9 @@ def raise_to_terrain(prisms: Sequence[Prism], ground: Ground) -> list[Prism]:
         # Closed ones are moved by their height later.
         if isinstance(surfaces, tuple):
             surfaces = surfaces[0] + [0.0, 0.0, low_m], surfaces[1]
-        stood.append(replace(prism, ground_m=low_m, model_surfaces=surfaces, height=replace(
+        raised.append(replace(prism, ground_m=low_m, model_surfaces=surfaces, height=replace(
             height, bottom_m=bottom_m, top_m=low_m + height.top_m)))
-    return stood
+    return raised
 
 
 def _lowest_ground_m(areas: Sequence[shapely.Geometry], ground: Ground) -> np.ndarray:
