@@ -97,7 +97,7 @@ def in_frame_of(scene: "rt.Scene | None", measurements: "rt.Measurements",
                 shift: str | None) -> "rt.Measurements":
     """Convert measurements to a scene's local frame, plus a shift of `DX,DY` [m] if one is given.
 
-    Without a scene they keep their frame.
+    Without a scene they keep their frame, and a shift raises BadInput.
     """
     shift_m = None
     if shift is not None:

@@ -67,9 +67,9 @@ def plan(
     require_folder(out, FILES, mark="plan.json")
     world, model = rt.Scene.load(scene), rt.Twin.load(twin)
     keep_inputs(out, data, no_fly, world.folder, twin)
-    at = None if base is None else parse_numbers("--base", base, 2)
+    xy_m = None if base is None else parse_numbers("--base", base, 2)
     settings = PlanSettings(
-        uavs=uavs, battery=battery, base_m=None if at is None else (at[0], at[1]), data=data,
+        uavs=uavs, battery=battery, base_m=(xy_m[0], xy_m[1]) if xy_m else None, data=data,
         silent=silent, data_spread=data_spread, clearance_m=clearance_m, sizes=sizes, wanted=wanted,
         areas=[each.outline for each in read_areas(no_fly, world)] if no_fly else [],
         worlds=worlds, iterations=iterations, seed=seed)

@@ -141,7 +141,7 @@ def build_scene(
 def _measured(path: Path, on_terrain: bool) -> tuple[float | None, list[float] | None]:
     """Return the devices' median frequency [Hz], and altitudes for the lattice [m] as measured.
 
-    None where unknown, with a note; so are heights above the datum if the scene has terrain.
+    None, with a note, where unknown, or where heights are above the datum and there is terrain.
     """
     import numpy as np
 

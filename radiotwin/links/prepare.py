@@ -67,7 +67,7 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
             be.
 
     Returns:
-        the usable links; their `notes` say what was left out or odd. Levels at a fill value become
+        the usable links, with `notes` on what was left out or odd. Levels at a fill value become
         NaN, and empty heights `ASSUMED_HEIGHT_M` above ground (receivers' only without a scene).
 
     Raises:

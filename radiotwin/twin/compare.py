@@ -83,7 +83,7 @@ class Comparison:
     def location_summary(self) -> pd.DataFrame:
         """Return median, 90th percentile and largest position error of each model [m].
 
-        `devices` is the number of located devices with a known true position.
+        `devices` is the number of devices with an estimated, even if vague, and a true position.
         """
         def summary(errors: pd.Series) -> pd.Series:
             return pd.Series({"devices": errors.count(), "median_m": errors.median(),
@@ -119,7 +119,7 @@ def split_flights(measurements: Measurements, held_out: int = 1
         held_out: number of held-out flights.
 
     Raises:
-        BadInput: no flight would be left to learn from.
+        BadInput: `held_out` is below 1, or no flight would be left to learn from.
     """
     flights = measurements.flights
     if held_out < 1:
@@ -288,7 +288,7 @@ def comparable_db(candidate: RadioMap, truth: RadioMap) -> np.ndarray:
 
 
 def _los(scene: Scene, true_m: dict, links: Measurements) -> np.ndarray:
-    """Return the line of sight (n,) of links at true positions: 1, 0, or NaN if unknown."""
+    """Return the line of sight (n,) from true positions, moved outdoors: 1, 0; NaN: unknown."""
     position_m = np.array([true_m.get(name, (np.nan,) * 3) for name in links.devices["device"]])
     placed = np.isfinite(position_m).all(axis=1)
     position_m[placed] = moved_outdoors(scene.city, position_m[placed])  # as in the twins
@@ -301,7 +301,7 @@ def _los(scene: Scene, true_m: dict, links: Measurements) -> np.ndarray:
 
 def _scores(model: str, against: str, positions: str, measured_db: np.ndarray,
             predicted_db: np.ndarray, los: np.ndarray) -> list[dict]:
-    """Return RMSE, mean absolute error and bias [dB] of all, LoS (`los` 1) and NLoS (0) links."""
+    """Return errors [dB] of detected, predicted links: all, LoS (`los` 1), NLoS (0); NaN: none."""
     rows = []
     usable = np.isfinite(measured_db) & np.isfinite(predicted_db)
     for links, mask in zip(CLASSES, (usable, usable & (los == 1), usable & (los == 0))):
@@ -317,7 +317,7 @@ def _scores(model: str, against: str, positions: str, measured_db: np.ndarray,
 
 
 def _location_rows(model: str, twin: Twin, true_m: dict) -> list[dict]:
-    """Return a row with the position error and radius of each unknown device."""
+    """Return a row with horizontal error (NaN: no true position) of each unknown device [m]."""
     rows = []
     for device in twin.devices:
         if device.role == "unknown":

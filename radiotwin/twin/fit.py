@@ -72,7 +72,7 @@ def fit_twin(measurements: Measurements | pd.DataFrame | Path | str, scene: Scen
         the twin; `located` says of which devices the position is known.
 
     Warns:
-        Of more than `MAX_LINKS` links, as many are drawn, evenly among the devices.
+        Repeated rows are left out; of more than `MAX_LINKS` links, as many are drawn, evenly.
 
     Raises:
         BadInput: no anchor, nothing detected, links that no channel can be learnt from, an unknown
@@ -157,7 +157,7 @@ def _usable(measurements: Measurements) -> Measurements:
 
 
 def _thinned(measurements: Measurements, seed: int) -> Measurements:
-    """Draw MAX_LINKS random links, evenly among devices, and warn, if there are more."""
+    """Draw MAX_LINKS random links, evenly among devices (each at least one), and warn, if more."""
     device = measurements.device_index
     if len(device) <= MAX_LINKS:
         return measurements

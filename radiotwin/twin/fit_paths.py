@@ -58,20 +58,20 @@ def fit_along_paths(links: Links, scene: Scene, seed: int, start: Twin | None,
     by_paths = Model.build(links, twin.channel, dof, device_m=device_m)
     by_law = Model.build(links, law.channel, dof, device_m=law_m)
     fit, compared = by_paths.fit(), by_paths.usable & by_law.usable
-    heard = np.bincount(by_paths.group[by_paths.usable & np.isfinite(links.level_db)], minlength=2)
+    counts = np.bincount(by_paths.group[by_paths.usable & np.isfinite(links.level_db)], minlength=2)
     # Without slopes, which would turn path levels into a log-distance law
     levels_only = replace(by_paths, level_columns=by_paths.level_columns[:, :2],
                           level_prior_sd_db=by_paths.level_prior_sd_db[:2])
     loss_nats = levels_only.regression(compared).nll(levels_only.fit()).sum() \
         - by_law.regression(compared).nll(by_law.fit()).sum()
-    if heard[0] >= MIN_HEARD and loss_nats > MIN_LOSS_NATS * compared.sum():
+    if counts[0] >= MIN_HEARD and loss_nats > MIN_LOSS_NATS * compared.sum():
         warnings.warn("paths over the 3D map explain these levels worse than a law of distance and "
                       "line of sight does: is the map that of the area, and in the same frame? "
                       "Otherwise take the model segmented_nn", stacklevel=4)
-    if heard.min() < MIN_HEARD <= heard.max():
-        few, many = heard.argmin(), heard.argmax()
+    if counts.min() < MIN_HEARD <= counts.max():
+        few, many = counts.argmin(), counts.argmax()
         level_db = fit.coefficients[1 - many]  # columns begin with LoS, groups with NLoS
-        warnings.warn(f"only {heard[few]} links {('without', 'with')[few]} line of sight were "
+        warnings.warn(f"only {counts[few]} links {('without', 'with')[few]} line of sight were "
                       f"heard: they take the level of the others, {level_db:.1f} dB from the "
                       "power of the paths", stacklevel=4)
         fit = replace(fit, coefficients=np.array([level_db, level_db, 0.0, 0.0]),
@@ -111,7 +111,7 @@ def relocation_from(scene: Scene, max_radius_m: float, start: Twin | None = None
 
 
 def best_dof(links: Links, channel: ChannelModel, device_m: np.ndarray) -> float:
-    """Return those degrees of freedom of Student-t errors in DOFS with the greatest likelihood.
+    """Return the likeliest degrees of freedom in DOFS of Student-t errors, on the training links.
 
     Devices are at (k, 3) [m]; NaN: unknown.
     """
@@ -125,8 +125,8 @@ def _image_paths(links: Links, law: Twin, device_m: np.ndarray) -> ImagePaths:
     channel = ImagePaths(law.channel)
     located = links.with_located_devices(device_m)
     declared, antenna_db = located.declared, declared_antenna_db(located)
-    fed_db = 0.0 if declared.adds_nothing else declared.fed_db[located.device]
-    return channel.fit_diffuse(*located.gains(fed_db), antenna_db)
+    feed_db = 0.0 if declared.adds_nothing else declared.fed_db[located.device]
+    return channel.fit_diffuse(*located.gains(feed_db), antenna_db)
 
 
 def fit_over_wrong_map(links: Links, scene: Scene, seed: int, start: Twin | None,
@@ -245,7 +245,7 @@ def _radius_by_map_m(links: Links, devices: list[TwinDevice], channel: ImagePath
     known = {device.device: [(device.x_m, device.y_m)] for device in devices}
     with progress("locating over wrong maps", total=len(cities)) as advance:
         for city in cities:
-            search = Relocation(bounds, np.inf, positions={key: [*at] for key, at in known.items()})
+            search = Relocation(bounds, np.inf, positions={key: [*xy] for key, xy in known.items()})
             found = search.relocate(links.with_city(city), devices, channel)
             for square, before, after in zip(squares, devices, found, strict=True):
                 if after is not before:  # paths over this map locate it, too

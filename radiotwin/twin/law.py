@@ -40,7 +40,7 @@ def law_parameters(channel: ChannelModel, links: LinkGeometry, level_db: np.ndar
     if law is None:
         return []
     values = _values(law)
-    spread = np.full(len(values), np.nan)
+    half_width = np.full(len(values), np.nan)
     group = deal_groups(ground_blocks(links), GROUPS, np.random.default_rng(seed))
     groups = int(group.max()) + 1
     if groups > 2:
@@ -48,12 +48,12 @@ def law_parameters(channel: ChannelModel, links: LinkGeometry, level_db: np.ndar
                                     len(links))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            left = np.array([_values(type(law)().fit(links.select(rows), level_db[rows],
+            fits = np.array([_values(type(law)().fit(links.select(rows), level_db[rows],
                                                      limits_db[rows]))
                              for rows in (group != number for number in range(groups))])
-        error = np.sqrt((groups - 1) / groups * ((left - left.mean(axis=0)) ** 2).sum(axis=0))
-        spread = student_t.ppf(0.95, groups - 1) * error
-    return _rows(law, values, spread)
+        error = np.sqrt((groups - 1) / groups * ((fits - fits.mean(axis=0)) ** 2).sum(axis=0))
+        half_width = student_t.ppf(0.95, groups - 1) * error
+    return _rows(law, values, half_width)
 
 
 def parameters_of(channel: ChannelModel, refit_db: np.ndarray, sd_db: np.ndarray
@@ -95,18 +95,18 @@ def _values(law: LogDistance | SegmentedLogDistance) -> np.ndarray:
                      for line in _lines(law).values()]).ravel()
 
 
-def _rows(law: LogDistance | SegmentedLogDistance, values: np.ndarray, spread: np.ndarray
+def _rows(law: LogDistance | SegmentedLogDistance, values: np.ndarray, half_width: np.ndarray
           ) -> list[dict[str, Any]]:
-    """Return rows of `COLUMNS` from `_values` and the half widths `spread` of their intervals.
+    """Return rows of `COLUMNS` from `_values` and the half widths, as many, of their intervals.
 
-    Where `spread` is NaN, or a line is borrowed, the interval is None.
+    Where a half width is NaN, or a line is borrowed, the interval is None.
     """
     borrowed = getattr(law, "borrowed", None)
     names = [(links, parameter, unit) for links in _lines(law)
              for parameter, unit in ((LEVEL, "dB"), (EXPONENT, ""), (SD, "dB"))]
     rows = []
-    for (links, parameter, unit), value, reach in zip(names, values, spread, strict=True):
-        ends = np.array([value, value - reach, value + reach])
+    for (links, parameter, unit), value, half in zip(names, values, half_width, strict=True):
+        ends = np.array([value, value - half, value + half])
         if links.casefold() == borrowed:  # a borrowed line is a guess
             ends[1:] = np.nan
         if parameter == SD:

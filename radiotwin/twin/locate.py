@@ -45,8 +45,8 @@ def locate_devices(measurements: Measurements | pd.DataFrame | Path | str, twin:
         scene: the 3D map, or its folder, if the twin was made with one; None: the twin's own.
 
     Returns:
-        a row for each device: `device, x_m, y_m, radius_m` (90 % of the probability), `links`, and
-        `latitude_deg, longitude_deg` if the frame's origin is known; and notes on the data.
+        a row for each device with `MIN_LINKS` links: `device, x_m, y_m, radius_m` (90 % of the
+        probability), `links`, and if the origin is known `latitude_deg, longitude_deg`; and notes.
 
     Raises:
         BadInput: the twin needs a map, or was made without one; no unknown device; another quantity
@@ -144,7 +144,7 @@ def _by_channel(twin: Twin, links: Links) -> FittedModel:
 
 
 def _widening(model: FittedModel, links: Links, found: list[TwinDevice]) -> float:
-    """Return the factor, at least 1, by which radii grow as links fit worse than in training."""
+    """Return the factor on radii as links fit worse than in training; 1 up to `MIN_WIDENING`."""
     if np.isnan(model.typical_misfit) or not found:
         return 1.0
     row = {name: row for row, name in enumerate(links.device_names)}

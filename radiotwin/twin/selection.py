@@ -45,8 +45,8 @@ class HeldOut:
         """Compute the errors of channel models on links of the anchors that their fits left out.
 
         Each model is fitted once without each fold of flights (n,) or, with few flights, of ground
-        blocks. Levels and limits (n,) are as of `ChannelModel.fit`. None where too few links would
-        be left to learn from.
+        blocks; one that leaves a detected level unpredicted is left out. Levels and limits (n,) are
+        as of `ChannelModel.fit`. At most `MAX_LINKS` are drawn; None: too few to learn from.
         """
         if not len(flight):
             return None

@@ -60,7 +60,7 @@ class ErrorCorrelation:
                      ) -> "ErrorCorrelation":
         """Estimate the spatial correlation of errors (n,) [dB], and the spread of devices' levels.
 
-        Without a field, whose correlation is used, one is fitted.
+        The correlation is that of `field`; None: it is fitted. Devices with few links are left out.
         """
         rows = _sampled(device, np.isfinite(residual_db), seed)
         if not len(rows):

@@ -113,8 +113,8 @@ class Twin(Summarised):
             is of `radiotwin fit` and the channel needs no levels.
         devices: devices in the order of the measurements' `devices.csv`.
         level: predicted quantity: `gain_db`, or `rssi_dbm` if transmit power is unknown.
-        limit_db: limit of detection [dB], the median over receivers, see `Links.usual_limit_db`;
-            None: unknown.
+        limit_db: limit of detection [dB or dBm, as `level`], the median over receivers, see
+            `Links.usual_limit_db`; None: unknown.
         provenance: measurements, scene, seed and version of the fit.
         declared: declared powers, cables, antennas and carriers of the devices; they were
             subtracted from levels before the fit, and are added to predictions.
@@ -203,7 +203,7 @@ class Twin(Summarised):
 
     def links(self, receiver_m: np.ndarray, device: np.ndarray, scene: Scene | None = None
               ) -> Links:
-        """Make links to predict, without receiver names, flights and times.
+        """Make links to predict, without receivers, flights, times; unknown positions are at 0.
 
         Args:
             receiver_m: (n, 3) positions of the receivers [m].

@@ -110,8 +110,8 @@ class Relocation:
                  channel: ImagePaths) -> list[TwinDevice]:
         """Move unknown devices to the positions of greatest likelihood along paths.
 
-        A device keeps its position by the law unless paths explain its links better, and all do if
-        more than `MAX_DEVICES` are unknown.
+        A device keeps its position by the law unless paths explain its links better, its radius is
+        within `max_radius_m`, `MIN_HEARD` links are detected, and `MAX_DEVICES` at most are sought.
         """
         unknown = sum(device.role == "unknown" for device in devices)
         if unknown > MAX_DEVICES:
@@ -127,8 +127,8 @@ class Relocation:
             if device.role != "unknown":
                 continue
             rows = self._rows(links, number)
-            heard = np.isfinite(links.level_db[rows]).sum()
-            if device.credible_radius_m <= self.max_radius_m and heard >= MIN_HEARD:
+            detected = np.isfinite(links.level_db[rows]).sum()
+            if device.credible_radius_m <= self.max_radius_m and detected >= MIN_HEARD:
                 by_law, by_paths = (_Likelihood(fit, links, rows, number) for fit in fits)
                 before = self.positions.setdefault(device.device, [])
                 searches[number] = _Search(by_law, by_paths, self), device, before
@@ -398,8 +398,8 @@ class _Search:
         """Return the level (n,) [dB] of links from path power (n,), linear, and declared power."""
         channel, declared = self.by_paths.fit.channel, links.declared
         assert isinstance(channel, ImagePaths)
-        fed_db = 0.0 if declared.adds_nothing else declared.fed_db[self.by_paths.device]
-        return channel.level_db(power, links.geometry) + fed_db
+        feed_db = 0.0 if declared.adds_nothing else declared.fed_db[self.by_paths.device]
+        return channel.level_db(power, links.geometry) + feed_db
 
     def _try(self, positions_m: Iterable[np.ndarray]) -> list[float]:
         """Return the negative log-likelihood by paths of each position (2,) [nats]; cached."""
@@ -456,14 +456,14 @@ class _Search:
                             reading.mean_db, likelihood.fit.model.level_at)
 
     def _radius_m(self, best: _Place, design_effect: float) -> float:
-        """Return the radius around the best position with 90 % of the tried ones' probability."""
+        """Return the radius [m] with 90 % of the tried positions' probability, plus a step."""
         positions_m, values = np.array(list(self.tried)), np.array(list(self.tried.values()))
         apart_m = np.linalg.norm(positions_m[:, None] - positions_m, axis=2)
         area = np.where(apart_m > 0, apart_m, np.inf).min(axis=1) ** 2
-        share = area * np.exp((values.min() - values) / design_effect)
+        mass = area * np.exp((values.min() - values) / design_effect)
         from_best_m = np.linalg.norm(positions_m - best, axis=1)
         order = np.argsort(from_best_m)
-        held = np.searchsorted(np.cumsum(share[order]) / share.sum(), CREDIBLE)
+        held = np.searchsorted(np.cumsum(mass[order]) / mass.sum(), CREDIBLE)
         return float(from_best_m[order][min(held, len(order) - 1)] + STEPS_M[-1])
 
 

@@ -53,7 +53,8 @@ def calibrate_radii(models: list[FittedModel], held_out: list[Links], area_m: Ar
                     seed: int) -> RadiusCalibration:
     """Calibrate 90 % radii by locating anchors from held-out links as if they were unknown.
 
-    There is a model for each fold, fitted to the other folds, and the fold's links.
+    There is a model for each fold, fitted to the other folds, and the fold's links. The power is 1
+    with fewer than `MIN_DEVICES` devices; of many anchors, some are drawn.
     """
     with_map = held_out[0].city is not None
     trials = [(model, links, device) for model, links in zip(models, held_out, strict=True)
@@ -85,9 +86,9 @@ def calibrate_radii(models: list[FittedModel], held_out: list[Links], area_m: Ar
 
 def _enough_links(links: Links) -> np.ndarray:
     """Return the devices with MIN_LINKS links, of which at least one was detected."""
-    count, heard = (np.bincount(links.device[rows], minlength=len(links.device_names))
-                    for rows in (slice(None), np.isfinite(links.level_db)))
-    return np.flatnonzero((count >= MIN_LINKS) & (heard > 0))
+    count, detected = (np.bincount(links.device[rows], minlength=len(links.device_names))
+                       for rows in (slice(None), np.isfinite(links.level_db)))
+    return np.flatnonzero((count >= MIN_LINKS) & (detected > 0))
 
 
 def radius_factor(ratios: np.ndarray) -> float:
@@ -105,7 +106,7 @@ def radius_factor(ratios: np.ndarray) -> float:
 
 
 def misfit(model: FittedModel, device_links: Links, device: TwinDevice) -> float:
-    """Return the mean square of a located device's residuals over their scale, outliers clipped.
+    """Return the mean square of a device's residuals in error scales, clipped; NaN: none detected.
 
     The device's own level is first estimated and subtracted, with shrinkage.
     """

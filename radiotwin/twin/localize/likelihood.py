@@ -168,8 +168,8 @@ def design_effect(residuals: DeviceResiduals, correlation: np.ndarray) -> float:
 
     It is how much errors with a correlation (N_BINS,) widen the position's variance: trace(H^-1 J)
     / 2, where H = sum_i a_i a_i' and J = sum_ij (rho_ij + l_i l_j') a_i a_j' over links, with
-    slopes a of the levels and errors l of the law. It is multiplied by the mean square residual if
-    that is above 1.
+    slopes a of the levels and errors l of the law, times the mean square residual if above 1. It is
+    1 for fewer than three links.
     """
     if len(residuals.z) < 3:
         return 1.0
@@ -316,5 +316,5 @@ class Likelihood:
 
 
 def _columns(rows: np.ndarray, wanted: np.ndarray) -> np.ndarray | slice:
-    """Return the places of `wanted` in the sorted `rows`."""
+    """Return the index of each of `wanted` in the sorted `rows`; a slice if they are equal."""
     return slice(None) if len(rows) == len(wanted) else np.searchsorted(rows, wanted)

@@ -71,8 +71,8 @@ def merge_repeats(receiver_m: np.ndarray, device: np.ndarray, level_db: np.ndarr
                   devices: np.ndarray, *, use_missed: bool) -> Observations:
     """Merge the measurements (n,) of each device at each receiver position (to the millimetre).
 
-    Those of the `devices` (k,) are kept, in this order, and with `use_missed` those that were not
-    detected (NaN), too.
+    Kept are measurements of `devices` (k,), in this order; those not detected (level NaN) only with
+    `use_missed`.
     """
     rows = np.isin(device, devices)
     receiver_m, device, level_db = receiver_m[rows], device[rows], level_db[rows]
@@ -143,20 +143,20 @@ class LinkTable:
         Line of sight (p, c) is given; a table is for all devices.
         """
         xy_m = xy_m.astype(np.float32)
-        at = (xy_m[:, :1] - self._x[rows]) ** 2
-        at += (xy_m[:, 1:] - self._y[rows]) ** 2
-        at += np.float32(NEAR_M**2)
-        np.log(at, out=at)
-        at -= self._low
-        at *= self._per_node
-        node = np.minimum(at.astype(np.int32), NODES - 2)
-        at -= node
+        offset = (xy_m[:, :1] - self._x[rows]) ** 2
+        offset += (xy_m[:, 1:] - self._y[rows]) ** 2
+        offset += np.float32(NEAR_M**2)
+        np.log(offset, out=offset)
+        offset -= self._low
+        offset *= self._per_node
+        node = np.minimum(offset.astype(np.int32), NODES - 2)
+        offset -= node
         node += self._first_node[rows]
         node += los * np.int32(NODES)
         after = node + 1
         mean_db, sd_db = self._mean_db.take(node), self._sd_db.take(node)
-        mean_db += at * (self._mean_db.take(after) - mean_db)
-        sd_db += at * (self._sd_db.take(after) - sd_db)
+        mean_db += offset * (self._mean_db.take(after) - mean_db)
+        sd_db += offset * (self._sd_db.take(after) - sd_db)
         return mean_db, sd_db
 
 

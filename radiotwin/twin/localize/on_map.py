@@ -188,14 +188,14 @@ def swarm_search(log_likelihood: Callable[[np.ndarray, np.ndarray], np.ndarray],
     n_far = particles // 3
     x[:, particles - n_far :] = anywhere_m[rng.integers(len(anywhere_m), size=(s, n_far))]
     v = start_sd_m * rng.uniform(-1.0, 1.0, x.shape)
-    whose = np.repeat(device, particles)
-    own_best, own_value = x.copy(), log_likelihood(x.reshape(-1, 2), whose).reshape(s, particles)
+    devices = np.repeat(device, particles)
+    own_best, own_value = x.copy(), log_likelihood(x.reshape(-1, 2), devices).reshape(s, particles)
     for _ in range(iterations):
         best = own_best[np.arange(s), own_value.argmax(axis=1)][:, None]
         u1, u2 = rng.random((2, s, particles, 2))
         v = CONSTRICTION * (v + PHI_EACH * (u1 * (own_best - x) + u2 * (best - x)))
         x = x + v
-        value = log_likelihood(x.reshape(-1, 2), whose).reshape(s, particles)
+        value = log_likelihood(x.reshape(-1, 2), devices).reshape(s, particles)
         better = value > own_value
         own_best[better], own_value[better] = x[better], value[better]
         advance(1)

@@ -78,12 +78,12 @@ class Posterior:
         found = []
         for k in np.argsort(-weights)[: np.count_nonzero(weights)]:
             cells = patch == k
-            height = self.log_likelihood[cells]
-            share = self.width_m[cells] ** 2 * np.exp(height - height.max())
-            mean = share @ self.xy_m[cells] / share.sum()
+            nats = self.log_likelihood[cells]
+            mass = self.width_m[cells] ** 2 * np.exp(nats - nats.max())
+            mean = mass @ self.xy_m[cells] / mass.sum()
             outside = np.abs(self.cell_m[cells] - mean).max(axis=1).min() > self.width_m.max() / 2
             if outside or not allowed(mean[None])[0]:
-                mean = self.xy_m[cells][height.argmax()]
+                mean = self.xy_m[cells][nats.argmax()]
             found.append((mean, float(weights[k])))
         return found
 
@@ -105,9 +105,9 @@ def refine(log_likelihood: Callable[[np.ndarray], np.ndarray], centre_m: np.ndar
            likelihood_power: float) -> Posterior:
     """Split the likeliest cells of a scan until they are below FINEST_M, and normalise all.
 
-    Cells have centres (c, 2), points at which they were evaluated (c, 2), and values (c,). Those of
-    `peaks_m` (s, 2) are always split, because a peak may be narrower than a cell. The power of the
-    likelihood is at most 1.
+    Cells have centres (c, 2), points at which they were evaluated (c, 2), and values (c,); those
+    around `peaks_m` (s, 2) are always split, as a peak may be narrower than a cell. Split cells at
+    -inf, where no device may be, are dropped. The power of the likelihood is at most 1.
     """
     cell_m = centre_m
     done = []

@@ -141,7 +141,7 @@ def fit_elsewhere(model: FittedModel, device_links: Links, positions_m: np.ndarr
 
 def _finer(log_likelihood: np.ndarray, power: float, coarse_m: np.ndarray,
            width_m: float) -> tuple[np.ndarray, float]:
-    """Split the likeliest coarse cells, which hold HELD; return fine cells (c, 2) and width [m]."""
+    """Split the coarse cells that hold the probability HELD; return fine ones (c, 2), width [m]."""
     share = _normalised(power * log_likelihood)
     order = np.argsort(-share)
     held = order[:int(np.searchsorted(np.cumsum(share[order]), HELD)) + 1]

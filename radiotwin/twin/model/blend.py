@@ -88,12 +88,12 @@ class Blend:
     def away_m(self, links: Links) -> np.ndarray:
         """Return the distance (n,) [m] of each link's moving end from its nearest measurement.
 
-        Only measurements with the same other end count; inf: none.
+        Only measurements with the same fixed end count; inf: none.
         """
-        moving_m, other = moving_ends(links, self.receivers_move)
+        moving_m, fixed_end = moving_ends(links, self.receivers_move)
         away_m = np.full(len(links), np.inf)
-        for label in np.unique(other):
-            known_m, rows = self.measured_m[self.measured_other == label], other == label
+        for label in np.unique(fixed_end):
+            known_m, rows = self.measured_m[self.measured_other == label], fixed_end == label
             if len(known_m):
                 away_m[rows] = cKDTree(known_m).query(moving_m[rows])[0]
         return away_m

@@ -85,7 +85,7 @@ class Relatives:
             seed: int) -> Relatives | None:
         """Fit how residuals (n,) follow those of relatives (devices on one mast); None: too few.
 
-        Without a field, whose correlation is used, one is fitted.
+        The correlation is that of `field`; None: it is fitted. Residuals are in error scales.
         """
         heard = set(np.unique(links.device).tolist())
         devices = [(device, np.flatnonzero(np.isin(links.device, relatives)))
@@ -202,9 +202,9 @@ class CorrelatedShadowing:
         return cls(field, relative_sd, move, like is None or like.certain, relatives)
 
     def at(self, links: Links) -> tuple[np.ndarray, np.ndarray]:
-        """Interpolate the residual (n,) at links [error scales], and return the scale's share left.
+        """Return interpolated residual [error scales], remaining share of the error scale, (n,).
 
-        That is 1 far from measurements, or if not `certain`.
+        The share is 1 far from measurements, or if not `certain`.
         """
         mean, sd = self.field.predict(*_points(links, self.receivers_move))
         mean = self.relative_sd * mean

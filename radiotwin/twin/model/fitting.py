@@ -43,7 +43,7 @@ def refine(fit: Fit, evaluations: int = EVALUATIONS, descents: int = DESCENTS,
            max_links: int = MAX_LINKS, anywhere: bool = False) -> Fit:
     """Search better parameters of the last effect by descents on the training links' likelihood.
 
-    Each has so many evaluations for each parameter, on at most `max_links`; with `anywhere` they
+    A descent has `evaluations` for each parameter, on at most `max_links`; with `anywhere` descents
     also start at `Variation.starts`. Returns the given fit if the new one is not better.
     """
     model, last = fit.model, fit.effects[-1]
@@ -175,10 +175,9 @@ def add_effect(fit: Fit, effect: Effect, like: Effect | None = None,
     """Add an effect to a fitted model with its likeliest parameters, or load the earlier result.
 
     The effect takes the channel's quick levels, those of its fast law; `along_paths` replaces them
-    by exact ones, from tracing paths. `like` is the effect as fitted to all links, if `fit` is of a
-    fold, whose levels are exact if those of `like` are. It should explain the training links
-    `group` (m,), see `ResidualView.of_group`. None if it proposes no parameters for these
-    residuals.
+    by exact ones, from tracing paths. If `fit` is of a fold, `like` is the effect as fitted to all
+    links; exact levels of `like` give exact levels in the fold. The effect should explain the
+    training links `group` (m,), see `ResidualView.of_group`. None: it proposes no parameters.
     """
     inputs = (fit, effect, like) if group is None else (fit, effect, like, group)
     return cached("effect", inputs, lambda: _best_addition(fit, effect, like, group),
@@ -188,8 +187,8 @@ def add_effect(fit: Fit, effect: Effect, like: Effect | None = None,
 def along_paths(fit: Fit, without: Fit) -> Fit:
     """Refine the last effect with exact levels, from tracing paths again, in place of quick ones.
 
-    `without` is the fit without it. The given fit is returned if it is better, or the effect does
-    not use them (`Effect.always_exact`), gains too little, or changes too many links.
+    `without` is the fit without this effect. The given fit is returned if exact levels are worse or
+    unused (`Effect.always_exact`), or the effect gains too little or changes too many links.
     """
     effect, gain_nats = fit.effects[-1], without.objective - fit.objective
     changes_few = np.count_nonzero(fit.model.terms[-1].offset_db) <= MAX_FOLLOWED_LINKS

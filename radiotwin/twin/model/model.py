@@ -78,9 +78,9 @@ class Model:
               channel_db: np.ndarray | None = None) -> Model:
         """Build the regression model of a fitted channel on n links, without effects.
 
-        Devices may be at other positions (k, 3) [m], NaN without one. The training links (n,) are
-        all if None, and the mean level of the channel with declared powers and antennas (n,) [dB]
-        is predicted.
+        Devices may be at other positions (k, 3) [m]; at NaN their links are not used. `train` (n,)
+        are training links; None: all that are usable. `channel_db` (n,) is the channel's mean level
+        with declared powers and antennas [dB]; None: predicted.
         """
         usable = np.ones(len(links), dtype=bool)
         if device_m is not None:
@@ -162,7 +162,7 @@ class Model:
         return limit_db
 
     def fit(self, start: FitResult | None = None) -> Fit:
-        """Fit to the training links; a class of links without any takes the largest error scale."""
+        """Fit to the training links; an error scale without training link becomes the largest."""
         found = censored_regression.fit(self.training, start)
         trained = np.unique(self.training.group)
         scale_db = np.full(self.groups, found.scale_db[trained].max())
@@ -519,7 +519,7 @@ class FittedModel:
 def device_sd_db(fit: Fit) -> float:
     """Estimate the standard deviation of devices' mean residuals [dB] (method of moments).
 
-    The part that the scatter of single links explains is subtracted.
+    The part that the scatter of single links explains is subtracted; 0 of few devices or links.
     """
     problem = fit.model.training
     reading = problem.predict(fit)

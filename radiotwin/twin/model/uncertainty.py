@@ -44,7 +44,7 @@ class ReadingDerivative:
     sides: tuple[float, float] = (1.0, 1.0)
 
     def moved(self, known: np.ndarray, wanted: np.ndarray) -> ReadingDerivative:
-        """Return the derivative from links `known` to `wanted` (m,) bool; 0 where it is unknown."""
+        """Return the derivative on links of mask `wanted` (n,), from mask `known` (n,); else 0."""
         def on_wanted(values: np.ndarray) -> np.ndarray:
             on_all = np.zeros(len(known))
             on_all[known] = values
@@ -225,12 +225,12 @@ def _scores(fit: Fit, derivatives: list[ReadingDerivative], design_effect: float
         np.reshape([getattr(each, name) for each in derivatives], (len(derivatives), n)).T
         for name in ("mean_db", "log_scale", "score"))
     growth = np.broadcast_to(predicted.growth, n)[:, None]
-    passed = np.broadcast_to(predicted.slope, n)[:, None]
+    response_slope = np.broadcast_to(predicted.slope, n)[:, None]
     arriving = _beside([law, problem.gain_columns])
     zeros = np.zeros(arriving.shape)
     slope, scale_slope, curvature, scale_curvature = (
         values[:, None] for values in _curvatures(problem, predicted))
-    columns = _beside([arriving * passed, mean])
+    columns = _beside([arriving * response_slope, mean])
     scored, roots = columns * slope, [columns * np.sqrt(curvature)]
     if predicted.growth.any() or log_scale.any():
         columns = _beside([arriving * growth, log_scale])
