@@ -99,11 +99,11 @@ def _named(index: int, report: dict) -> list[dict]:
 
 
 def cause(name: str, members: Collection[str]) -> str:
-    """Describe a cause in words; some causes have other words for a receiver than for a device.
+    """Describe a cause in words; some causes are called differently at a receiver and a device.
 
     Args:
         name: of the effect, or of a hypothesis such as `another` cause.
-        members: the kinds of ends that the anomaly names: `device`, `receiver`, `flight`.
+        members: kinds of members that the anomaly names, of `device`, `receiver`, `flight`.
     """
     if name in (ANOTHER, OTHER):
         return "another cause"
@@ -117,25 +117,25 @@ def cause(name: str, members: Collection[str]) -> str:
 
 
 def group(anomaly: dict, origin: Origin | None = None) -> tuple[str, bool]:
-    """Name the links of an anomaly, such as "device d3 on flight f2"; also return if it is plural.
+    """Describe the links of an anomaly: "device d3 on flight f2"; also return if that is plural.
 
-    Ends that have exactly the same links are joined by "or". A place is given in latitude and
-    longitude if the origin of the local frame is known, else as x and y [m].
+    A device, receiver and flight with exactly the same links are joined by "or". A place is in
+    latitude and longitude if the origin of the local frame is known, else x and y [m].
     """
     members = {end: names for end in ENDS if (names := anomaly["members"].get(end))}
     text = ""
-    one = anomaly["family"] in ENDS and len(members) > 1  # ends with the same links
+    same_links = anomaly["family"] in ENDS and len(members) > 1
     for end, names in members.items():
-        joined = (" or " if one else f" {JOINED[end]} ") if text else ""
+        joined = (" or " if same_links else f" {JOINED[end]} ") if text else ""
         text += f"{joined}{end}{'s' * (len(names) > 1)} "
         text += some_names([apart(end, name) for name in names])
-    text += " (they never part)" * one
+    text += " (they never part)" * same_links
     is_plural = bool(members) and len(next(iter(members.values()))) > 1
-    sight = SIGHT.get(anomaly.get("sight", "all"), "")
+    los_words = SIGHT.get(anomaly.get("sight", "all"), "")
     if not members:
-        text, is_plural = f"links {sight}".rstrip(), True
-    elif sight:
-        text += f" ({sight})"
+        text, is_plural = f"links {los_words}".rstrip(), True
+    elif los_words:
+        text += f" ({los_words})"
     ranges = [_range(name, *ends, origin=origin) for name, ends in _ranges(anomaly)]
     return " ".join([text, *ranges]), is_plural
 
@@ -162,7 +162,7 @@ COLUMNS = ("group", "possible causes", "statistic", "against its peers", "90 % i
 
 
 def seen_from(report: dict) -> str:
-    """Say how many dB a device, receiver or flight has to be off to be found; empty if unknown."""
+    """Say how many dB off a device, receiver or flight would have been found; empty if unknown."""
     found = [f"a {each['family']} that is {each['size']:.1f} dB off"
              for each in report.get("seen_from", [])
              if each["family"] in ENDS and each["statistic"] == "level"]
@@ -235,7 +235,7 @@ def _predicate(anomaly: dict, report: dict, is_plural: bool) -> str:
 
 
 def _peers(anomaly: dict, report: dict, is_plural: bool) -> str:
-    """Name what an anomaly is compared with, such as "the seven others"."""
+    """Name the peers of an anomaly, such as "the seven others": those with held-out links."""
     family = anomaly["family"]
     if family in PEERS:
         return PEERS[family].format(its="their" if is_plural else "its")

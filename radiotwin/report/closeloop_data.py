@@ -116,10 +116,10 @@ class EffectData:
         return clear if self.found.of_receiver and clear.sum() >= MIN_LOS_LINKS else detected
 
     def panels(self) -> list[tuple[str, np.ndarray]]:
-        """Return title and link indices of each panel: for devices or receivers changed most.
+        """Return title and link rows of each panel: up to `MAX_MEMBERS` devices or receivers.
 
-        They are ranked by the standard deviation of the effect's contribution on their links. An
-        effect without parameters for each end has a single panel, of all links.
+        They are those with the largest standard deviation of the effect's contribution, from
+        `MIN_SHARE` of the largest. Without a member kind there is one panel, of all links to draw.
         """
         shown, kind = self.shown, self.member_kind
         if not kind:
@@ -147,7 +147,7 @@ class LoopData:
         added: names of the effects that were added to the base, in the order in which they were.
         drivers: variables that the residual depends on, those before the effects first.
         effects: the effects that were found.
-        interpolated_db: (n,) held-out contribution of correlated shadowing [dB], where it is kept.
+        interpolated_db: (n,) held-out contribution of correlated shadowing [dB]; None: not added.
     """
 
     links: DrawnLinks
@@ -215,8 +215,8 @@ class BinMeans:
     """Means over bins of links.
 
     Attributes:
-        at: (b,) mean of the variable in each bin.
-        mean: (b,) mean of what is averaged [dB].
+        at: (b,) mean of the variable in each bin, in its unit.
+        mean: (b,) mean of the residuals or levels [dB].
         error: (b,) standard error of the mean [dB].
     """
 
@@ -226,7 +226,7 @@ class BinMeans:
 
 
 def bin_index(value: np.ndarray, count: int) -> np.ndarray:
-    """Return the bin (n,) of each finite value, in up to `count` bins of about equally many values.
+    """Return the bin of each value (n,), all finite: up to `count` bins of about as many values.
 
     If there are no more than `count` distinct values, each of them is a bin.
     """
@@ -241,24 +241,23 @@ def bin_means(index: np.ndarray, value: np.ndarray, residual_db: np.ndarray,
               block: np.ndarray) -> BinMeans:
     """Average the residuals of links (n,) in each bin; bins of fewer than `MIN_LINKS` drop out.
 
-    Links of one block share an error, so a block is one observation in the standard error.
+    The standard error is that of independent blocks, but at least that of independent links.
 
     Args:
         index: (n,) bin of each link.
-        value: (n,) variable that was binned; its mean is where a bin is drawn.
+        value: (n,) variable that was binned, in any unit; its mean is where a bin is drawn.
         residual_db: (n,) what is averaged [dB].
-        block: (n,) index of each link's block.
+        block: (n,) index of each link's block of links with a common error.
     """
     count = np.bincount(index)
     mean = np.bincount(index, weights=residual_db) / np.maximum(count, 1)
     deviation_db = residual_db - mean[index]
     pairs, pair = np.unique(np.column_stack([index, block]), axis=0, return_inverse=True)
     sums = np.bincount(pair.ravel(), weights=deviation_db)
-    between = np.bincount(pairs[:, 0], weights=sums**2)
-    # At least the standard error of independent links: in a bin of a single block the deviations
-    # sum to zero.
-    independent = np.bincount(index, weights=deviation_db**2)
-    error = np.sqrt(np.maximum(between, independent)) / np.maximum(count, 1)
-    at = np.bincount(index, weights=value) / np.maximum(count, 1)
+    by_blocks = np.bincount(pairs[:, 0], weights=sums**2)
+    # In a bin of a single block the deviations sum to zero.
+    by_links = np.bincount(index, weights=deviation_db**2)
+    error = np.sqrt(np.maximum(by_blocks, by_links)) / np.maximum(count, 1)
+    centre = np.bincount(index, weights=value) / np.maximum(count, 1)
     used = count >= MIN_LINKS
-    return BinMeans(at[used], mean[used], error[used])
+    return BinMeans(centre[used], mean[used], error[used])

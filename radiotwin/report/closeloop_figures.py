@@ -64,7 +64,7 @@ ELSEWHERE = {"place_of_ray", "place_of_receiver", "device", "receiver", "flight"
 
 
 def effect_figure(effect: EffectData, background: MapBackground) -> Figure:
-    """Draw an effect in the figure that it names, or else the usual one for its kind (stage)."""
+    """Draw an effect in the figure that it names, else that of its stage, else over a variable."""
     kind = effect.found.figure or FIGURE_OF_STAGE.get(effect.found.stage, "")
     return FIGURES.get(kind, variable_figure)(effect, background)
 
@@ -126,7 +126,7 @@ def pattern_figure(effect: EffectData, _: MapBackground) -> Figure:
 def histogram_figure(effect: EffectData, _: MapBackground) -> Figure:
     """Draw histograms of the residual [dB] without and with the effect.
 
-    Of an effect on links without line of sight alone, only those are counted.
+    Of an effect on NLoS links only, NLoS links are counted; of all others, all detected links.
     """
     rows, los = np.isfinite(effect.residual_db), effect.links.los
     nlos = effect.found.nlos_only and (rows & ~los).any()
@@ -149,7 +149,7 @@ def histogram_figure(effect: EffectData, _: MapBackground) -> Figure:
 
 
 def interval_figure(effect: EffectData, background: MapBackground) -> Figure:
-    """Draw an effect's parameter for each device or receiver as a bar with its 90 % interval.
+    """Draw an effect's `MAX_BARS` largest parameters of devices or receivers with 90 % intervals.
 
     Parameters that the data do not determine are left out; if all are, `variable_figure` is drawn.
     """
@@ -184,10 +184,10 @@ FIGURE_OF_STAGE = {"paths": "histogram", "detection": "intervals", "limit": "int
 def _means_figure(effect: EffectData, value: np.ndarray, measured_db: np.ndarray,
                   fitted_db: np.ndarray, labels: tuple[str, str, str],
                   draw_line: Callable[[Axes, BinMeans], object]) -> Figure:
-    """Draw measured values of links over a variable: dots, means, and means of the fitted values.
+    """Draw levels or residuals (n,) [dB] of links over a variable: dots, means, and fitted means.
 
-    `labels` are those of the measured means, of x and of y. `draw_line` adds what the means are
-    compared with, given the fitted ones.
+    `labels` are those of the measured means, of x and of y. `draw_line` adds a line of reference to
+    the axes, given the fitted means.
     """
     figure, axes = _grid(len(effect.panels()))
     for number, (ax, (title, rows)) in enumerate(zip(axes, effect.panels())):
@@ -208,7 +208,7 @@ def _means_figure(effect: EffectData, value: np.ndarray, measured_db: np.ndarray
 
 
 def _closed_curve(fitted: BinMeans) -> tuple[np.ndarray, np.ndarray]:
-    """Return azimuth [rad] and radius of a closed polar curve; NaN where no links are."""
+    """Return azimuth [rad] and radius [dB] of a closed polar curve; NaN in gaps over two bins."""
     azimuth_deg = np.r_[fitted.at, fitted.at[:1] + 360]
     radius = np.r_[fitted.mean, fitted.mean[:1]]
     gaps = np.flatnonzero(np.diff(azimuth_deg) > 2 * 360 / EFFECT_BINS) + 1
@@ -256,7 +256,7 @@ def _grid(count: int, projection: str | None = None) -> tuple[Figure, list[Axes]
 
 
 def _limits(links_db: np.ndarray, means_db: np.ndarray) -> tuple[float, float]:
-    """Return the ends of an axis [dB] that shows 96 % of the links, and all means."""
+    """Return the ends of an axis [dB] that shows the links but 2 % at each end, and all means."""
     low, high = np.quantile(links_db, [0.02, 0.98]) if len(links_db) else (-1.0, 1.0)
     low, high = min(low, *means_db, high), max(high, *means_db, low)
     margin = 0.05 * (high - low) + 0.1
@@ -281,8 +281,8 @@ def write_closeloop_figures(loop: Loop, scene: Scene | None, report: dict,
         loop: result of the close-loop.
         scene: whose buildings are drawn; None: no 3D map.
         report: content of `closeloop.json`.
-        folder: for `groups.png`, `waterfall.png`, `residual_map.png`, `level_map.png`,
-            `drivers.png`, and `effect_RANK_NAME.png` for each effect.
+        folder: for `groups.png`, `waterfall.png`, `residual_map.png`, `effect_RANK_NAME.png` for
+            each effect and, if there is something to draw, `level_map.png` and `drivers.png`.
     """
     folder, data = Path(folder), collect(loop)
     background = MapBackground(data.links, scene)
@@ -304,7 +304,7 @@ def waterfall_figure(report: dict) -> Figure:
     """Draw how the held-out RMSE falls: the base model, the change by each effect, the result.
 
     Effects are what the base lacks and was added to it. Other models of `closeloop.json` are
-    horizontal lines, up to `MAX_LINE` times the highest bar.
+    horizontal lines; above `MAX_LINE` times the highest bar they are left out.
     """
     error = report["error"]
     before, after = error["before"]["rmse_db"] or 0.0, rmse_after_db(error) or 0.0
@@ -386,7 +386,7 @@ def dependence_figure(data: LoopData) -> Figure | None:
 def _draw_curves(ax: Axes, before: BinMeans, after: BinMeans, changed: bool) -> None:
     """Draw mean residuals before and after the effects over a variable, with standard errors.
 
-    If nothing was added (`changed`), only those before are drawn.
+    Without effects (`changed` is false), only the mean residuals before are drawn.
     """
     curves = [(before, BEFORE, "before"), (after, AFTER, "after")]
     for curve, colour, label in curves if changed else curves[:1]:
@@ -408,7 +408,7 @@ def _draw_bar(ax: Axes, position: int, start: float, end: float, colour: str, te
 
 
 def _connect(ax: Axes, position: int, level: float) -> None:
-    """Draw a thin line from the bar before to the bar at a position."""
+    """Draw a thin line at a level [dB] from the previous bar to the bar at a position."""
     ax.plot([position - 0.65, position + 0.35], [level, level], color="0.5", linewidth=0.8)
 
 

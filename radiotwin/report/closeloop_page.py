@@ -134,12 +134,13 @@ def _cards(report: dict) -> list[tuple[str, str]]:
     it that repeats at a place; share of held-out readings in their 90 % intervals.
     """
     error, cards = report["error"], [("verdict", words.verdict(report))]
-    before, of = number(error["before"].get("rmse_db")), f"RMSE of {error['before']['n']:,} links"
+    before = number(error["before"].get("rmse_db"))
+    label = f"RMSE of {error['before']['n']:,} links"
     if words.has_additions(report):
         after = number(words.rmse_after_db(error))
-        cards.append((f"{of}, before and after", f"{before} → {after} dB"))
+        cards.append((f"{label}, before and after", f"{before} → {after} dB"))
     else:
-        cards.append((f"{of}, as before", f"{before} dB"))
+        cards.append((f"{label}, as before", f"{before} dB"))
         parts_db = words.split_db(report)
         if parts_db is not None:
             cards.append(("of that, repeats at a place", f"{number(parts_db[0])} dB"))
@@ -188,10 +189,8 @@ def _evidence(effect: dict) -> str:
 def _error_table(report: dict, kinds: tuple[str, ...]) -> Table:
     """Return the table of held-out errors before and after effects were added, by group of links.
 
-    Args:
-        report: content of `closeloop.json`.
-        kinds: groups that get rows: each `device`, `receiver`, `flight`, or class of `los`; with
-            `los` also all links together, and other models on them.
+    Groups are by `kinds` (`device`, `receiver`, `flight`, `los`), up to `MAX_ROWS` a kind, or the
+    kind is left out. With `los` all links come first, with other models.
     """
     rows: list[list[str]] = []
     others = dict(islice(report["baselines"].items(), MAX_MODELS if "los" in kinds else 0))
@@ -258,7 +257,7 @@ def _value(parameter: dict) -> str:
 
 
 def _interval(parameter: dict) -> str:
-    """Return the 90 % interval of a parameter as text; a dash if there is none."""
+    """Return the 90 % interval of a parameter as text; a dash if not determined or of width 0."""
     low, high = parameter["low"], parameter["high"]
     unknown = None in (low, high) or low == high or not parameter.get("determined", True)
     unit = parameter["unit"]

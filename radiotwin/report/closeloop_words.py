@@ -88,7 +88,7 @@ def objects(report: dict) -> list[str]:
 
 
 def _object_words(effect: dict, origin: Origin | None) -> str:
-    """Describe a cause: its devices or receivers, dimensions, antenna direction, and place."""
+    """Describe a cause: devices or receivers, size, antenna direction, place; if determined."""
     forms = effects_named(effect["name"])
     form = next((each for each in forms if each.variant == effect.get("variant")), None)
     words = form and form.in_words or name_label(effect["name"])
@@ -140,7 +140,7 @@ def is_sure(report: dict) -> bool:
 
 
 def rivals(report: dict) -> str:
-    """Say how probable each found cause is, and what else the first of them may be."""
+    """Say how probable each found cause is, and what else the first one may be."""
     causes = found_causes(report)
     known = [f"{name_label(each['name'])} {probability(each['probability'])}" for each in causes
              if each.get("probability") is not None]
@@ -155,10 +155,10 @@ def rivals(report: dict) -> str:
 
 
 def _rivals_of(cause: dict, step: dict, report: dict) -> list[str]:
-    """List what else a cause may be that was found at a step, with probabilities.
+    """List with probabilities what else a cause that was found at a step may be.
 
-    What the cause leaves of the probability is divided among the other hypotheses of the step, in
-    proportion to theirs.
+    One minus its probability is divided among the step's other hypotheses, in proportion to their
+    probabilities; shares below `LIKELY` are left out.
     """
     named = {each["name"] for each in report["effects"]}
     others = {each["name"]: each["probability"] or 0.0 for each in step["probabilities"]
@@ -273,7 +273,7 @@ def _side_by_side(found: dict) -> str:
 
 
 def rmse_after_db(error: dict) -> float:
-    """Return the RMSE with the effects [dB], on links that have a prediction without them, too."""
+    """Return the RMSE with the effects [dB], on links that the base predicts, too."""
     return (error.get("after_same_links") or error["after"]).get("rmse_db")
 
 
@@ -382,7 +382,7 @@ def _undecided_words(report: dict) -> str:
 
 
 def _settled_by(report: dict) -> str:
-    """Say which measurements would decide between the likeliest causes; empty if none is known."""
+    """Name two measurements at most that decide between the likeliest causes; empty if unknown."""
     step = next(iter(report["posterior"]), None)
     if step is None:
         return ""
@@ -438,9 +438,9 @@ def _probability_in_brackets(report: dict, name: str) -> str:
 
 
 def split_db(report: dict) -> tuple[float, float] | None:
-    """Split the base's RMSE [dB] into what repeats at a place, and what differs between readings.
+    """Split the base's RMSE into errors [dB] that repeat at a place, and that differ by reading.
 
-    The squares of both add up to that of the RMSE. None if they were not estimated.
+    Their squares add up to that of the RMSE. None if they were not estimated.
     """
     step = next(iter(report["posterior"]), None)
     whole_db = report["error"]["before"]["rmse_db"]

@@ -249,7 +249,7 @@ def _scatter_figure(comparison: Comparison, models: list[str]) -> Figure:
 
 
 def _estimates_figure(comparison: Comparison, models: list[str], scene: Scene) -> Figure:
-    """Draw true and estimated positions of the devices with 90 % circles, a panel a model."""
+    """Draw true and estimated device positions by model; 90 % radii up to twice the map's width."""
     extent = scene.config.extent
     ratio = (extent.x_max_m - extent.x_min_m) / (extent.y_max_m - extent.y_min_m)
     figure, axes = panels(1, len(models), 6.4 * min(max(ratio, 0.7), 1.4), 6.4)

@@ -28,13 +28,7 @@ ROUND_LENGTHS = (1, 2, 5, 10)
 
 
 def write_coverage_pictures(coverage: Coverage, scene: Scene, folder: Path) -> None:
-    """Write a PNG of each raster: `received_power.png`, `best_server.png`, ….
-
-    Args:
-        coverage: of the network.
-        scene: whose buildings are drawn.
-        folder: to write to.
-    """
+    """Write a PNG of each raster over the scene's buildings: `received_power.png`, …."""
     heights = height_grid(scene, OUTLINE_CELLS)
     for name in drawn_rasters(coverage):
         save(_coverage_figure(coverage, scene, name, heights), folder / f"{file_stem(name)}.png")
@@ -54,18 +48,18 @@ def _coverage_figure(coverage: Coverage, scene: Scene, name: str, heights: Heigh
               cmap=ListedColormap(legend.colours), vmin=-0.5, vmax=len(legend.colours) - 0.5,
               interpolation="nearest")
     draw_streets(ax, scene)
-    height_m, over = heights
+    height_m, grid_m = heights
     building = height_m > BUILDING_M
-    indoors = coverage.settings.indoor_loss_db is not None
-    if not indoors:
+    has_indoor_levels = coverage.settings.indoor_loss_db is not None
+    if not has_indoor_levels:
         # Cells whose middle is inside, and the outlines in full detail.
         ax.imshow(np.where(coverage.dataset["indoor"].values, 1.0, np.nan), origin="lower",
                   extent=bounds_m, cmap=ListedColormap([BUILDING_COLOUR]),
                   interpolation="nearest")
-        ax.imshow(np.where(building, 1.0, np.nan), origin="lower", extent=over,
+        ax.imshow(np.where(building, 1.0, np.nan), origin="lower", extent=grid_m,
                   cmap=ListedColormap([BUILDING_COLOUR]), interpolation="nearest")
     if building.any():
-        ax.contour(building, levels=[0.5], origin="lower", extent=over, colors=OUTLINE_COLOUR,
+        ax.contour(building, levels=[0.5], origin="lower", extent=grid_m, colors=OUTLINE_COLOUR,
                    linewidths=0.4)
     _draw_transmitters(ax, coverage)
     for area in coverage.areas:
@@ -77,7 +71,7 @@ def _coverage_figure(coverage: Coverage, scene: Scene, name: str, heights: Heigh
            ylabel="y, north [m]")
     ax.set_title(legend.title, loc="left", fontweight="bold")
     _draw_scale_bar(ax, bounds_m)
-    handles = _handles(legend, classes, coverage, bool(building.any()) and not indoors)
+    handles = _handles(legend, classes, coverage, bool(building.any()) and not has_indoor_levels)
     figure.legend(handles=handles, loc="outside right upper", frameon=False,
                   alignment="left", title="share of the area", title_fontsize="small")
     figure.supxlabel(_caption(coverage, scene), fontsize=7, color="#444444")
@@ -134,9 +128,9 @@ def _draw_scale_bar(ax: Axes, bounds_m: tuple[float, float, float, float]) -> No
     """Draw a bar of a round length, about a fifth of the width, in the lower left corner."""
     x_min, x_max, y_min, y_max = bounds_m
     wanted_m = (x_max - x_min) / 5
-    power = 10.0 ** np.floor(np.log10(wanted_m))
-    # The logarithm of what is just below a power of ten may be that of the power.
-    length_m = max((each * power for each in ROUND_LENGTHS if each * power <= wanted_m),
+    decade_m = 10.0 ** np.floor(np.log10(wanted_m))
+    # log10 of a length just below a power of ten may be rounded up to that of the power.
+    length_m = max((each * decade_m for each in ROUND_LENGTHS if each * decade_m <= wanted_m),
                    default=wanted_m)
     margin_m, thick_m = 0.02 * (x_max - x_min), 0.006 * (y_max - y_min)
     text = f"{length_m / 1000:g} km" if length_m >= 1000 else f"{length_m:g} m"

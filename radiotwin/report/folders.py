@@ -316,8 +316,8 @@ def _read_maps(run: Run, truth: str | None) -> None:
 def _open_maps(run: Run, truth: str | None, stack: ExitStack) -> dict[str, RadioMap | MapStream]:
     """Open the maps of a run by name: truth, twin's map, and those in its folder; read later.
 
-    A map that is not over the scene's lattice is left out with a line in `run.notes`, or refused
-    with BadInput if it was given as `truth`.
+    A map of another lattice, or a truth of another version of the scene, is left out with a line in
+    `run.notes`; BadInput if it was given as `truth`.
     """
     maps: dict[str, RadioMap | MapStream] = {}
     if truth is not None and truth != "segmented":
@@ -358,7 +358,7 @@ def _open_maps(run: Run, truth: str | None, stack: ExitStack) -> dict[str, Radio
 def _tracks(run: Run, measurements: Path | None) -> pd.DataFrame | None:
     """Read the UAVs' positions over time from `flights.csv`, measurements, or held-out links.
 
-    None if there are none of these, or if readings lack a time.
+    None if there are none of these, or if any reading lacks a time.
     """
     path = _first(run.folder, "flights.csv")
     if measurements is None and path is not None:

@@ -26,11 +26,11 @@ class Pivot:
     """Table of residuals by two ends, such as device and flight.
 
     Attributes:
-        axes: what the rows and the columns are, such as `device` and `flight`.
+        axes: what rows and columns are: two of `device`, `receiver` and `flight`.
         names: of rows and of columns.
-        median_db: (rows, columns) [dB]; NaN where there are few links.
-        scatter_db: (rows, columns) standard deviation, robust [dB].
-        left_out: members that are not shown, by end.
+        median_db: (rows, columns) median residual [dB]; NaN with fewer than `MIN_LINKS` links.
+        scatter_db: (rows, columns) robust standard deviation of residuals [dB]; NaN likewise.
+        left_out: number of members that are not shown, by end.
     """
 
     axes: tuple[str, str]
@@ -42,7 +42,7 @@ class Pivot:
 
 def pivot(links: DrawnLinks, residual_db: np.ndarray, ends: tuple[str, str],
           anomalies: Sequence[dict]) -> Pivot:
-    """Tabulate median and scatter of residuals (n,) [dB] by two ends, such as device and flight.
+    """Tabulate median and scatter of residuals (n,) [dB] by two of device, receiver and flight.
 
     Up to `MAX_MEMBERS` names of each end get a row or column: those in anomalies (deviating groups
     of links) first, then those with the largest mean square residual.
@@ -116,7 +116,7 @@ def _is_part(anomaly: dict) -> bool:
 
 
 def _framed_members(anomaly: dict) -> dict[str, Sequence[str]]:
-    """Return an anomaly's names by end; if its family is an end, such as device, those alone."""
+    """Return an anomaly's names by kind; if its family is a kind, such as device, only that one."""
     members, family = anomaly["members"], anomaly["family"]
     return {family: members[family]} if family in members else members
 
@@ -138,7 +138,7 @@ def _label(ax: Axes, found: Pivot, column: int) -> None:
 
 
 def _write_numbers(ax: Axes, values: np.ndarray, low: float, high: float) -> None:
-    """Write each cell's value into it, white on dark; none if columns exceed `MAX_NUMBERS`."""
+    """Write each cell's value [dB] into it, white on dark; none in over `MAX_NUMBERS` columns."""
     if values.shape[1] > MAX_NUMBERS:
         return
     for (row, column), value in np.ndenumerate(values):
@@ -160,8 +160,8 @@ def _frame(ax: Axes, found: Pivot, members: dict[str, Sequence[str]], is_part: b
     spans = []
     for end, names in zip(found.axes, found.names, strict=True):
         chosen = members.get(end)
-        at = [place for place, name in enumerate(names) if chosen is None or name in chosen]
-        spans.append(_consecutive(at))
+        shown = [place for place, name in enumerate(names) if chosen is None or name in chosen]
+        spans.append(_consecutive(shown))
     for top, bottom in spans[0]:
         for left, right in spans[1]:
             ax.add_patch(Rectangle((left - 0.5, top - 0.5), right - left + 1, bottom - top + 1,

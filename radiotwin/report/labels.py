@@ -127,7 +127,7 @@ def join_names(names: list[str]) -> str:
 
 
 def number(value: float | None) -> str:
-    """Format a number: two decimals, integers with none, small ones two digits; None as a dash."""
+    """Format a number: two decimals, from 1000 none, below 0.1 two digits; None as a dash."""
     if value is None:
         return "–"
     if isinstance(value, int):
@@ -149,7 +149,7 @@ def quantity(value: float | None, unit: str) -> str:
 
 
 def two_digits(value: float) -> str:
-    """Round a number to two digits: 110 for 106.2."""
+    """Round a number to two significant digits: 110 for 106.2."""
     return f"{float(f'{value:.2g}'):,.10g}"
 
 

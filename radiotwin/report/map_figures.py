@@ -86,7 +86,7 @@ def write_picture(radio_map: RadioMap, scene: Scene, path: Path | str,
 
 
 def _radio_map_figure(radio_map: RadioMap, scene: Scene, devices: Sequence[TwinDevice]) -> Figure:
-    """Draw the level of the first `MAX_PANELS` devices at the lowest altitude, a panel for each."""
+    """Draw the lowest altitude of `MAX_PANELS` devices at most, thinned to `MAX_CELLS` a side."""
     names = radio_map.devices[:MAX_PANELS]
     radio_map = radio_map.thinned(max(-(-max(radio_map.lattice.shape[1:]) // MAX_CELLS), 1))
     level_db = radio_map.dataset["gain_db"].variable[:len(names), 0].values
@@ -251,33 +251,33 @@ class MapBackground:
 
     @property
     def cell_m(self) -> float:
-        """Return the side of a map cell, a round number [m]."""
+        """Return the side of a map cell [m]: a round number, about 1/`CELLS` of the longer side."""
         x_min, x_max, y_min, y_max = self.bounds
         wanted = max(max(x_max - x_min, y_max - y_min) / CELLS, MIN_CELL_M)
         power = 10.0 ** np.floor(np.log10(wanted))
         return float(next(step * power for step in ROUND_STEPS if step * power >= 0.95 * wanted))
 
     def panel_height(self, width_in: float) -> float:
-        """Return the height of a panel in the map's proportions [inches]."""
+        """Return a panel's height in the map's proportions, 0.4 to 1.3 of its width [inches]."""
         x_min, x_max, y_min, y_max = self.bounds
         return width_in * min(max((y_max - y_min) / max(x_max - x_min, 1.0), 0.4), 1.3)
 
     def frame(self, positions_m: np.ndarray) -> tuple[float, float, float, float]:
         """Return x_min, x_max, y_min, y_max [m] of the part of the map around positions (n, 2) [m].
 
-        It has the map's proportions. Without positions it is the whole map.
+        It has the map's proportions and 0.3 of its size or more; all of it without positions.
         """
         x_min, x_max, y_min, y_max = self.bounds
         if not len(positions_m):
             return self.bounds
         low, high = positions_m.min(axis=0) - MARGIN_M, positions_m.max(axis=0) + MARGIN_M
-        middle, size = 0.5 * (low + high), np.array([x_max - x_min, y_max - y_min])
-        half = 0.5 * size * min(max(*((high - low) / size), 0.3), 1.0)
+        middle, span_m = 0.5 * (low + high), np.array([x_max - x_min, y_max - y_min])
+        half = 0.5 * span_m * min(max(*((high - low) / span_m), 0.3), 1.0)
         middle = np.clip(middle, np.array([x_min, y_min]) + half, np.array([x_max, y_max]) - half)
         return middle[0] - half[0], middle[0] + half[0], middle[1] - half[1], middle[1] + half[1]
 
     def draw(self, ax: Axes) -> None:
-        """Draw buildings, streets, and the links' fixed ends (devices or receivers); axes [m]."""
+        """Draw buildings, streets, and the links' fixed ends if up to `MAX_MARKS`; axes [m]."""
         x_min, x_max, y_min, y_max = self.bounds
         if self._scene is not None:
             draw_streets(ax, self._scene)
@@ -312,8 +312,8 @@ class MapBackground:
         """Average the known values of links (n,) [dB] over the map cell of their moving end.
 
         Returns:
-            edges of the cells in x and in y [m], and (ny, nx) means [dB]; NaN where a cell has
-            fewer than `MIN_LINKS` links
+            edges (nx + 1,) and (ny + 1,) of the cells in x and in y [m], and (ny, nx) means [dB];
+            NaN where a cell has fewer than `MIN_LINKS` links
         """
         known = np.isfinite(value_db)
         x_min, x_max, y_min, y_max = self.bounds
@@ -343,7 +343,7 @@ class MapBackground:
 
 
 def mark(ax: Axes, effect: EffectData) -> None:
-    """Draw the place of an effect with its name; an effect without a place is left out."""
+    """Draw the place of an effect with its name; nothing for an effect without a place."""
     found = effect.mark
     if found is None:
         return

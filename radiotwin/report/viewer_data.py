@@ -56,7 +56,7 @@ def pack(values: np.ndarray) -> dict:
 
 
 def pack_db(level_db: np.ndarray) -> dict:
-    """Pack levels [dB] as 16-bit integers in hundredths, within ±327 dB; NaN as `NOT_DETECTED`."""
+    """Pack levels as int16 in 0.01 dB, clipped to ±327.67 dB; NaN as `NOT_DETECTED`."""
     hundredths = np.round(100 * np.nan_to_num(np.asarray(level_db, dtype=float), nan=0.0))
     clipped = np.clip(hundredths, -32767, 32767)
     return pack(np.where(np.isnan(level_db), NOT_DETECTED, clipped).astype(np.int16))
@@ -71,7 +71,8 @@ def map_layers(run: Run) -> list[dict]:
     """Pack level, standard deviation, line of sight and error of each radio map of a run.
 
     Levels are received powers [dBm] if the twin was fitted to such and the map has all transmit
-    powers, else gains [dB]. Of large maps every n-th position is taken, and `run.notes` says so.
+    powers, else gains [dB]. Errors are of maps on the truth's lattice only. Of large maps every
+    n-th position is taken, and `run.notes` says so.
     """
     step = _thinning(run)
     truth = run.maps.get(TRUTH)
@@ -146,15 +147,15 @@ def link_layer(run: Run) -> dict | None:
 
 
 def _has_paths(run: Run) -> bool:
-    """Return whether the page has paths of links: its map is small enough to follow them."""
+    """Return whether the page has paths: it has links, and a map of up to `MAX_FACES` triangles."""
     return (run.scene is not None and len(run.scene.city.faces) <= MAX_FACES
             and run.residuals is not None and not run.residuals.empty)
 
 
 def path_layer(scene: Scene, links: pd.DataFrame) -> dict:
-    """Follow the strongest reflected and diffracted paths of the links with the largest residuals.
+    """Follow the `MAX_PATHS` strongest paths of the `MAX_PATH_LINKS` links of largest residual.
 
-    Paths are followed over the scene's map, without buildings that a close-loop found.
+    Reflected and diffracted paths over the scene's map, without buildings that a close-loop found.
 
     Args:
         scene: 3D map and carrier frequency.
@@ -204,7 +205,7 @@ def _interval_db(residual_db: np.ndarray) -> list[float]:
 
 
 def device_layer(run: Run) -> list[dict]:
-    """Return each device's name, role, true position (None: not known), and the twin's estimate."""
+    """Return each device's name, role, true position and the twin's estimate; None: not known."""
     devices: dict[str, dict] = {}
     for known in run.scene.config.devices if run.scene else []:
         devices[known.device] = {"name": known.device, "role": known.role, "estimate": None,
@@ -243,9 +244,9 @@ def found_layer(run: Run) -> list[dict]:
 
 
 def flight_layer(run: Run) -> list[dict]:
-    """Pack start and end of each flight [s], and each UAV's positions over time since its start.
+    """Pack start and duration (`end_s`) of each flight [s], and UAVs' positions since its start.
 
-    `run.notes` says if tracks or positions are left out.
+    Unknown coordinates become 0. `run.notes` says if tracks or positions are left out.
     """
     tracks = run.tracks
     if tracks is None or tracks.empty:
@@ -272,7 +273,7 @@ def flight_layer(run: Run) -> list[dict]:
 
 
 def bounds_m(run: Run) -> list[float]:
-    """Return x_min, x_max, y_min, y_max [m] of the scene, else of all devices, tracks and links."""
+    """Return x_min, x_max, y_min, y_max [m] of the scene, else 1 m around all positions."""
     if run.scene is not None:
         return list(run.scene.config.extent.bounds)
     devices = [device["estimate"] or device["true"] for device in device_layer(run)]
