@@ -217,11 +217,11 @@ def fit(problem: CensoredRegression, start: FitResult | None = None) -> FitResul
 
 def _least_squares(problem: CensoredRegression) -> np.ndarray:
     """Compute start coefficients (p,) by ridge regression on the detected levels."""
-    seen = np.isfinite(problem.level_db)
+    known = np.isfinite(problem.level_db)
     first_scale_db = np.full(int(problem.group.max()) + 1, FIRST_SCALE_DB)
     predicted = problem.linearise(np.zeros(len(problem.prior_sd_db)), first_scale_db)
-    score = np.where(seen, predicted.slope * (problem.level_db - predicted.mean_db), 0.0)
-    slope, squares = _moments(problem, predicted, score, np.where(seen, predicted.slope**2, 0.0))
+    score = np.where(known, predicted.slope * (problem.level_db - predicted.mean_db), 0.0)
+    slope, squares = _moments(problem, predicted, score, np.where(known, predicted.slope**2, 0.0))
     ridge = np.diag(np.square(FIRST_SCALE_DB / problem.prior_sd_db) + 1e-6)
     return np.linalg.solve(squares + ridge, slope)
 
@@ -262,9 +262,9 @@ def _slope_and_hessian(problem: CensoredRegression, predicted: Linearisation,
     growth, information = predicted.growth, 2 * problem.dof / (problem.dof + 3)
     toward, hessian = _moments(problem, predicted, slope * predicted.slope + scale_slope * growth,
                                curvature * predicted.slope**2 + information * growth**2)
-    seen = np.isfinite(problem.level_db)
-    passed = np.broadcast_to(predicted.passed, seen.shape)
-    detected = np.bincount(problem.group, weights=passed * seen)
+    is_detected = np.isfinite(problem.level_db)
+    passed = np.broadcast_to(predicted.passed, is_detected.shape)
+    detected = np.bincount(problem.group, weights=passed * is_detected)
     total = np.bincount(problem.group, weights=passed * scale_slope)
     change = np.where(detected > 1, total / np.maximum(detected, 1) / information, 0.0)
     change = np.clip(change, -MAX_GROWTH, MAX_GROWTH)

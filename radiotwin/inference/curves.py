@@ -86,8 +86,8 @@ class Curves:
 def compare_curves(found: Statistic, curve: np.ndarray, prior_sd: float, part: str) -> Curves:
     """Estimate how much each curve varies over its bins, and how likely peers vary as much.
 
-    `found` are levels of k bins, `curve` (k,) each bin's curve, `prior_sd` that of the bins of a
-    curve that does not stand out, `part` the name of this part of the data.
+    `found` are levels of k bins, `curve` (k,) each bin's curve, `prior_sd` the sd [dB] of the bins
+    of a curve that does not stand out, `part` the name of this part of the data.
     """
     count = int(curve.max()) + 1
     known = np.isfinite(found.value) & (found.error > 0)

@@ -43,13 +43,13 @@ def gaussian_nll(level_db: np.ndarray, mean_db: np.ndarray, sd_db: np.ndarray,
     variables'), or 0 if the limit is unknown.
     """
     missing = np.isnan(level_db)
-    seen = 0.5 * ((level_db - mean_db) / sd_db) ** 2 + np.log(sd_db) + HALF_LOG_2PI
+    of_detected = 0.5 * ((level_db - mean_db) / sd_db) ** 2 + np.log(sd_db) + HALF_LOG_2PI
     if not missing.any():
-        return seen
+        return of_detected
     if limit_db is None:
-        return np.where(missing, 0.0, seen)
-    below = np.where(np.isneginf(limit_db), 0.0, -log_ndtr((limit_db - mean_db) / sd_db))
-    return np.where(missing, below, seen)
+        return np.where(missing, 0.0, of_detected)
+    of_blank = np.where(np.isneginf(limit_db), 0.0, -log_ndtr((limit_db - mean_db) / sd_db))
+    return np.where(missing, of_blank, of_detected)
 
 
 def mean_if_detected(mean_db: np.ndarray, sd_db: np.ndarray,

@@ -144,9 +144,9 @@ def medians(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
     key = (group.astype(np.int64) << 32) | np.rint((values - least) / step).astype(np.int64)
     key.sort()
     begin = np.searchsorted(key, np.arange(count + 1, dtype=np.int64) << 32)
-    size = np.diff(begin)
-    filled = size > 0
-    low, high = begin[:-1] + (size - 1) // 2, begin[:-1] + size // 2
+    number = np.diff(begin)
+    filled = number > 0
+    low, high = begin[:-1] + (number - 1) // 2, begin[:-1] + number // 2
     middle = (key[low[filled]] & (2**32 - 1)) + (key[high[filled]] & (2**32 - 1))
     found[filled] = least + 0.5 * step * middle
     return found
@@ -224,8 +224,8 @@ def _with_error(value: np.ndarray, step: np.ndarray, influence: np.ndarray, grou
     enough = (number >= least[0]) & (units >= least[1]) & (effective >= least[2])
     if is_bin and enough.any():
         ratio = sandwich[enough] / np.maximum(independent[enough], TINY)
-        usual = independent * np.sqrt(np.average(ratio**2, weights=units[enough]))
-        sandwich = np.sqrt((units * sandwich**2 + PEER_WEIGHT * usual**2) / (units + PEER_WEIGHT))
+        typical = independent * np.sqrt(np.average(ratio**2, weights=units[enough]))
+        sandwich = np.sqrt((units * sandwich**2 + PEER_WEIGHT * typical**2) / (units + PEER_WEIGHT))
     error = independent if lasting_sd is None else np.hypot(
         sandwich, lasting_sd / np.sqrt(effective))
     return Statistic(np.where(enough, value, np.nan), np.where(enough, error, np.nan))
@@ -233,9 +233,9 @@ def _with_error(value: np.ndarray, step: np.ndarray, influence: np.ndarray, grou
 
 def _pairs(group: np.ndarray, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Assign a number to each pair (m,) of group and unit, and list the group of each number."""
-    size = np.int64(unit.max(initial=0) + 1)
-    pairs, pair = np.unique(group * size + unit, return_inverse=True)
-    return pair.ravel(), pairs // size
+    unit_count = np.int64(unit.max(initial=0) + 1)
+    pairs, pair = np.unique(group * unit_count + unit, return_inverse=True)
+    return pair.ravel(), pairs // unit_count
 
 
 @dataclass(frozen=True, eq=False)
@@ -311,8 +311,8 @@ def combine_parts(parts: list[PeerComparison]) -> PeerComparison:
     """Average comparisons of the same groups over parts of the data, weighted by 1/variance."""
     if len(parts) == 1:
         return parts[0]
-    sizes = np.array([each.size for each in parts])
-    known = np.isfinite(sizes)
+    deviations = np.array([each.size for each in parts])
+    known = np.isfinite(deviations)
     variance = np.array([each.error**2 + each.spread**2 for each in parts])
     weight = np.where(known, 1 / np.where(known, variance, 1.0), 0.0)
     total = weight.sum(axis=0)
@@ -324,8 +324,8 @@ def combine_parts(parts: list[PeerComparison]) -> PeerComparison:
         summed = np.sum(share**power * filled**power, axis=0) ** (1 / power)
         return np.where(missing, np.nan, summed)
 
-    size = np.where(missing, np.nan, np.sum(share * np.where(known, sizes, 0.0), axis=0))
-    return PeerComparison(size, combined([each.error for each in parts], 2),
+    deviation = np.where(missing, np.nan, np.sum(share * np.where(known, deviations, 0.0), axis=0))
+    return PeerComparison(deviation, combined([each.error for each in parts], 2),
                           combined([each.spread for each in parts], 2),
                           combined([each.dof for each in parts], 1))
 
@@ -367,9 +367,9 @@ def subtract_unit_errors(values: np.ndarray, label: np.ndarray, unit: np.ndarray
     towards 0, and is 0 if only one group was in it.
     """
     cell_of, of_group = _pairs(label, unit)
-    size = np.int64(unit.max(initial=0) + 1)
-    cell = np.unique(label * size + unit)
-    of_unit = np.unique(cell % size, return_inverse=True)[1].ravel()
+    unit_count = np.int64(unit.max(initial=0) + 1)
+    cell = np.unique(label * unit_count + unit)
+    of_unit = np.unique(cell % unit_count, return_inverse=True)[1].ravel()
     middle = medians(values, cell_of, len(cell))
     visits = np.bincount(of_unit)
     shrink = np.where(visits > 1, visits / (visits + 1.0), 0.0)

@@ -49,7 +49,7 @@ class Scores:
     def covariances(self, clusterings: list[np.ndarray]) -> list[np.ndarray]:
         """Compute covariances (q, q), each scaled so that ±1.645 sd is a 90 % interval.
 
-        The first is that of independent rows, then one per clustering (n,), e.g. by place or
+        The first is for independent rows, then one per clustering (n,), e.g. by place or
         flight, of two or more clusters, its sd widened by Student's t. The interval of a parameter,
         or contrast, is the widest of them. With too few effective clusters, a parameter keeps the
         sd of independent rows.

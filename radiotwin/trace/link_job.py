@@ -432,9 +432,9 @@ def solve_exchanged(scene: Scene, settings: SolverSettings, store: BatchStore, i
                     executor: Executor, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Trace links with their ends exchanged: rays start at the receivers (the solver `paths`).
 
-    By reciprocity the gains should not change. Of the lattice positions `columns`, evenly spaced
-    ones are taken, about as many as `exchanged_calls` allows. Returns their indices, and their
-    gains (devices, positions) [dB].
+    By reciprocity the gains should not change. The lattice positions are spread evenly over
+    `columns`, as many as `exchanged_calls` allows. Returns their indices, and the gains (devices,
+    positions) [dB] as `solve_lattice`.
     """
     by_antenna: dict[int, list[int]] = {}  # all points of a call have the same antenna
     for device in index:

@@ -71,10 +71,10 @@ class TracePlan:
         Each has a core like this machine's. Counted are a worker's start, the unfinished batches,
         10 % more for the noise estimate, and batches with exchanged ends.
         """
-        left = self.batches - self.finished
-        if not left:
+        unfinished = self.batches - self.finished
+        if not unfinished:
             return 0.0
-        rounds = math.ceil(((1 + NOISE_SHARE) * left + self.exchanged) / workers)
+        rounds = math.ceil(((1 + NOISE_SHARE) * unfinished + self.exchanged) / workers)
         return self.start_s + rounds * self.batch_s
 
     def rows(self) -> list[tuple[int, float, float]]:

@@ -435,7 +435,7 @@ def trace_points(scene: Scene, points_m: np.ndarray, settings: SolverSettings | 
     points_m = np.asarray(points_m, dtype=float).reshape(-1, 3)
     index = device_indices(scene, devices)
     ROWS.check(len(index) * len(points_m), "points times devices")
-    inside, below = scene.city.inside(points_m), scene.city.below_ground(points_m)
+    inside, below_ground = scene.city.inside(points_m), scene.city.below_ground(points_m)
     wavelength_m = speed_of_light / scene.config.radio.frequency_hz
     antennas = [scene.device_antennas[device] for device in index]
     gain_db = trace_gains(scene, scene.device_m[index], points_m, settings, antennas,
@@ -444,9 +444,9 @@ def trace_points(scene: Scene, points_m: np.ndarray, settings: SolverSettings | 
     tables = []
     for row, device in enumerate(index):
         device_m = scene.device_m[device]
-        near = np.linalg.norm(points_m - device_m, axis=1) < wavelength_m
+        within_wavelength = np.linalg.norm(points_m - device_m, axis=1) < wavelength_m
         reason = np.select(
-            [inside & below, inside, near, np.isnan(gain_db[row]),
+            [inside & below_ground, inside, within_wavelength, np.isnan(gain_db[row]),
              gain_db[row] == IMPOSSIBLE_DB, gain_db[row] < scene.config.gain_limit_db],
             ["below the ground", "inside a building", "within a wavelength", "no path",
              "impossible gain", "below sensitivity"], default="")

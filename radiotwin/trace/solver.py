@@ -354,7 +354,7 @@ class CellGains:
         self._city.add(self._transmitter)
 
     def solve(self, device_m: np.ndarray, z_m: float) -> np.ndarray:
-        """Return the gains (ny * nx,) of cells at an altitude [dB]; NaN where no ray passed."""
+        """Return the gains (ny * nx,) of cells at an altitude [dB]; NaN if no ray crosses one."""
         import drjit
 
         settings, lattice = self.settings, self.lattice

@@ -63,8 +63,8 @@ def fit_class(level_db: np.ndarray, limits_db: np.ndarray, paths: np.ndarray,
     offset. Returns (2,) offset [dB], and ln of the error scale [dB] over an exact map, in -3..4.
     """
     if start is None:
-        seen = np.isfinite(level_db)
-        start = np.array([np.median((level_db - paths)[seen]), 0.5])
+        detected = np.isfinite(level_db)
+        start = np.array([np.median((level_db - paths)[detected]), 0.5])
 
     def nll(parameters: np.ndarray) -> float:
         class_scale_db = float(np.exp(np.clip(parameters[1], -3, 4)))
@@ -78,7 +78,7 @@ def fit_class(level_db: np.ndarray, limits_db: np.ndarray, paths: np.ndarray,
 class LinkFit:
     """Fit level offset and error scale of LoS and NLoS again and again for other computed levels.
 
-    Each fit starts from the result of the one before.
+    Each fit starts from the result of the last fit.
 
     Attributes:
         level_db: (n,) measured levels [dB]; NaN: not detected.

@@ -98,8 +98,8 @@ class ResidualField:
         """Fit the correlation over distance, store the points, and return the field itself.
 
         Residuals (n,), of unit variance, are at positions (n, 3) [m]; `series` (n,) is the index of
-        the field of each, `kind` (n,) that of, e.g., the phone (None: all the same). `seed` draws
-        the points to which the correlation is fitted.
+        the field of each, `kind` (n,) the index of, e.g., the phone (None: all the same). `seed`
+        draws the points to which the correlation is fitted.
         """
         rng = np.random.default_rng(seed)
         kind = np.zeros(len(series), dtype=int) if kind is None else kind

@@ -120,7 +120,7 @@ def _estimate_sizes(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
 def _mean_square_db(links: LinkGeometry, base_db: np.ndarray,
                     power: tuple[tuple[float, float], Offsets], size_m: tuple[float, float],
                     seed: int) -> np.ndarray:
-    """Return the mean square level change (n,) [dB²] from a map to random wrong copies of it.
+    """Return the mean square level change (n,) [dB²] from a map to copies with random errors.
 
     `base_db` (n,) are the levels over the given map, `power` the arguments of `paths_db`, `size_m`
     the standard deviations of walls and of heights in the copies. Zeros without a map.

@@ -126,7 +126,7 @@ class PathKriging(ChannelModel):
     def _over_maps(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
         """Return mean (n,) [dB] and variance (n,) [dB²] of path levels over the possible maps.
 
-        These are the given map and, if it has errors, copies with random ones of these sizes.
+        The given map and, if it has errors, copies with random errors of the estimated sizes.
         """
         power = self.diffuse, self.map_error.offsets_db
         levels_db = [paths_db(links, *power)]

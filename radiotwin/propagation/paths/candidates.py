@@ -145,18 +145,18 @@ def _sample_edges(surfaces: Surfaces, before: np.ndarray, edge: np.ndarray, devi
             continue
         facets = before[way, :sequence_length(before, way)]
         source_images(surfaces.planes, facets, device_m, image)
-        at = edge[way]
-        out_x = edges[at, NORMAL_0] + edges[at, NORMAL_N]
-        out_y = edges[at, NORMAL_0 + 1] + edges[at, NORMAL_N + 1]
-        out_z = edges[at, NORMAL_0 + 2] + edges[at, NORMAL_N + 2]
+        edge_row = edge[way]
+        out_x = edges[edge_row, NORMAL_0] + edges[edge_row, NORMAL_N]
+        out_y = edges[edge_row, NORMAL_0 + 1] + edges[edge_row, NORMAL_N + 1]
+        out_z = edges[edge_row, NORMAL_0 + 2] + edges[edge_row, NORMAL_N + 2]
         skin = SKIN_M / np.sqrt(out_x ** 2 + out_y ** 2 + out_z ** 2)
         for k in range(first, samples[way], SAMPLE_STEP):
             share = (k + 0.5) / samples[way]
             along_m = lit_m[way, 0] + share * (lit_m[way, 1] - lit_m[way, 0])
-            along_m = min(max(along_m, 0.0), edges[at, LENGTH])
-            x = edges[at, START] + along_m * edges[at, ALONG]
-            y = edges[at, START + 1] + along_m * edges[at, ALONG + 1]
-            z = edges[at, START + 2] + along_m * edges[at, ALONG + 2]
+            along_m = min(max(along_m, 0.0), edges[edge_row, LENGTH])
+            x = edges[edge_row, START] + along_m * edges[edge_row, ALONG]
+            y = edges[edge_row, START + 1] + along_m * edges[edge_row, ALONG + 1]
+            z = edges[edge_row, START + 2] + along_m * edges[edge_row, ALONG + 2]
             points_m = points.points_m[found]
             if reflections_back(surfaces.planes, surfaces.triangle_uv_m, facets, x, y, z, image,
                                 points_m):
@@ -191,16 +191,16 @@ def _with_facets_after(surfaces: Surfaces, ways: PathsToEdges, first: np.ndarray
         edge = ways.edge[way]
         room = depth - 1 - sequence_length(ways.before, way)
         for row in range(first[edge], end[edge]):
-            at, length = row - first[edge], sequence_length(after, row)
+            place, length = row - first[edge], sequence_length(after, row)
             if length == 0:
-                open_window(surfaces.edges, edge, ways.lit_m[way], window[at])
-                is_open[at] = True
+                open_window(surfaces.edges, edge, ways.lit_m[way], window[place])
+                is_open[place] = True
             else:
-                window[at] = window[parent[row] - first[edge]]
-                is_open[at] = length <= room and is_open[parent[row] - first[edge]] and narrow(
+                window[place] = window[parent[row] - first[edge]]
+                is_open[place] = length <= room and is_open[parent[row] - first[edge]] and narrow(
                     surfaces.planes, surfaces.edges, edge, after[row], length - 1,
-                    ways.source_m[way], window[at])
-            if is_open[at]:
+                    ways.source_m[way], window[place])
+            if is_open[place]:
                 of_way[count], of_after[count] = way, row
                 count += 1
     return of_way[:count], of_after[:count]
@@ -289,7 +289,7 @@ def _shoot(city: CityMap, facets: CityFacets, start_m: np.ndarray, direction: np
     sequences, of_source = [np.empty((sources, 0), dtype=int)], [np.arange(sources)]
     parents = [np.arange(sources)]
     first = [0]
-    seen = []
+    next_facets = []
     count = sources
     for level in range(depth + beyond):
         distance_m, facet = np.concatenate(
@@ -300,7 +300,7 @@ def _shoot(city: CityMap, facets: CityFacets, start_m: np.ndarray, direction: np
         # Few are distinct: faster than np.unique, which sorts all rays.
         inverse, pairs = pd.factorize(row * len(normal) + facet, sort=True)
         parent, last = np.divmod(pairs, len(normal))
-        seen.append(np.column_stack([parent, last]))
+        next_facets.append(np.column_stack([parent, last]))
         if level == depth:
             break
         sequences.append(np.column_stack([sequences[-1][parent - first[-1]], last]))
@@ -317,7 +317,7 @@ def _shoot(city: CityMap, facets: CityFacets, start_m: np.ndarray, direction: np
     order = np.repeat(np.arange(len(sequences)), [len(part) for part in sequences])
     return FacetSequences(np.concatenate(of_source), np.concatenate(padded), order,
                           np.concatenate(parents),
-                          np.concatenate(seen or [np.empty((0, 2), dtype=int)]))
+                          np.concatenate(next_facets or [np.empty((0, 2), dtype=int)]))
 
 
 def _first_facets(city: CityMap, facets: CityFacets, start_m: np.ndarray, direction: np.ndarray

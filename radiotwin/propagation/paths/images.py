@@ -256,8 +256,8 @@ def _from_edge(planes: np.ndarray, uv_m: np.ndarray, edges: np.ndarray, edge: in
                             mirror[k, 0], mirror[k, 1], mirror[k, 2])
         if not ok:
             return False, x, y, z
-        at = first + 1 + k
-        points_m[at, 0], points_m[at, 1], points_m[at, 2] = x, y, z
+        place = first + 1 + k
+        points_m[place, 0], points_m[place, 1], points_m[place, 2] = x, y, z
     return True, edge_x, edge_y, edge_z
 
 
@@ -347,8 +347,8 @@ def _move_off_surfaces(surfaces: Surfaces, candidates: Candidates, buffer: PathB
                 x = edges[edge, NORMAL_0] + edges[edge, NORMAL_N]
                 y = edges[edge, NORMAL_0 + 1] + edges[edge, NORMAL_N + 1]
                 z = edges[edge, NORMAL_0 + 2] + edges[edge, NORMAL_N + 2]
-                size = np.sqrt(x * x + y * y + z * z)
-                x, y, z = x / size, y / size, z / size
+                norm = np.sqrt(x * x + y * y + z * z)
+                x, y, z = x / norm, y / norm, z / norm
             else:
                 facet = candidates.before[row, k - 1] if k <= before \
                     else candidates.after[row, k - before - 2]

@@ -121,12 +121,12 @@ def follow_rays(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, fre
 
 def _direct(city: CityMap, device_m: np.ndarray, ends_m: np.ndarray, wave_number: float) -> Rays:
     """Return the direct paths (ITU-R P.525-4, eq. 4) to the receivers that see the device."""
-    seen = np.flatnonzero(city.line_of_sight(device_m, ends_m))
-    length_m = np.linalg.norm(ends_m[seen] - device_m, axis=1)
-    forth = unit_vectors(ends_m[seen] - device_m)
+    lit = np.flatnonzero(city.line_of_sight(device_m, ends_m))
+    length_m = np.linalg.norm(ends_m[lit] - device_m, axis=1)
+    forth = unit_vectors(ends_m[lit] - device_m)
     amplitude = np.exp(-1j * wave_number * length_m) / np.maximum(2 * wave_number * length_m, 1e-9)
-    return Rays(seen, amplitude, length_m, np.zeros((len(seen), MAX_INTERACTIONS), dtype=np.int8),
-                np.full((len(seen), MAX_INTERACTIONS, 3), np.nan), forth, -forth)
+    return Rays(lit, amplitude, length_m, np.zeros((len(lit), MAX_INTERACTIONS), dtype=np.int8),
+                np.full((len(lit), MAX_INTERACTIONS, 3), np.nan), forth, -forth)
 
 
 def _along_terrain(city: CityMap, device_m: np.ndarray, ends_m: np.ndarray, rows: np.ndarray,
@@ -244,10 +244,10 @@ def _check(points_m: np.ndarray, velocity: np.ndarray | None, bandwidth_hz: floa
 
 def _reasons(scene: Scene, device: int, points_m: np.ndarray) -> np.ndarray:
     """Return the reason (n,) why a device has no link to a point; empty if it may have one."""
-    inside, below = scene.city.inside(points_m), scene.city.below_ground(points_m)
+    inside, below_ground = scene.city.inside(points_m), scene.city.below_ground(points_m)
     wavelength_m = speed_of_light / scene.config.radio.frequency_hz
-    near = np.linalg.norm(points_m - scene.device_m[device], axis=1) < wavelength_m
-    return np.select([inside & below, inside, near],
+    within_wavelength = np.linalg.norm(points_m - scene.device_m[device], axis=1) < wavelength_m
+    return np.select([inside & below_ground, inside, within_wavelength],
                      ["below the ground", "inside a building", "within a wavelength"], default="")
 
 

@@ -168,9 +168,9 @@ def path_powers(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, fre
     powers[0] = _direct(city, device_m, receiver_m, wave_number)
     far = is_far(device_m, receiver_m)
     near = np.flatnonzero(~far)
-    seen = near[powers[0, near] > 0]
-    straight_m = receiver_m[seen] - device_m
-    directions = [_directions(seen, powers[0, seen], straight_m, -straight_m)]
+    in_los = near[powers[0, near] > 0]
+    straight_m = receiver_m[in_los] - device_m
+    directions = [_directions(in_los, powers[0, in_los], straight_m, -straight_m)]
     search = candidate_search(city, depth)
     buffer = PathBuffer.allocate(PATH_CHUNK)
     slabs = city_slabs(city, frequency_hz)
@@ -210,7 +210,7 @@ def path_powers(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, fre
 
 def _strongest_candidates(candidates: Candidates, found: Sequence[tuple[np.ndarray, ...]],
                           total: np.ndarray, over_seen_edge: np.ndarray) -> Candidates:
-    """Select the candidates to try again from positions close by: those of strong paths (p,).
+    """Select the candidates of strong paths, to try again from positions close by.
 
     Also one for each edge that the device sees. `found` holds candidate, link and power (p,) of
     paths, `total` (n,) is a link's power.

@@ -83,16 +83,16 @@ def _possible(edges: np.ndarray, to_try: EdgePairsToTry, device_m: np.ndarray,
               receiver_m: np.ndarray) -> np.ndarray:
     """List rows (t, 3) of receiver, first and second edge that Keller's cones do not rule out.
 
-    A cone at the first edge must meet the second, and the other way round.
+    The device's cone at the first edge must meet the second; the receiver's cone, the first.
     """
-    n, seen = len(receiver_m), len(to_try.edge)
+    n, first_edges = len(receiver_m), len(to_try.edge)
     end_m = np.empty((len(edges), 2, 3))
     for k in range(len(edges)):
         end_m[k, 0] = edges[k, START:START + 3]
         end_m[k, 1] = end_m[k, 0] + edges[k, LENGTH] * edges[k, ALONG:ALONG + 3]
     # Rays from the device over a first edge meet a second edge or not, for any receiver.
     meets = np.empty(len(to_try.second), dtype=np.bool_)
-    for j in range(seen):
+    for j in range(first_edges):
         for row in range(to_try.first[j], to_try.first[j + 1]):
             meets[row] = _cone_meets(edges, to_try.edge[j], device_m, end_m[to_try.second[row]])
     out = np.empty((1024, 3), dtype=np.int64)
@@ -102,7 +102,7 @@ def _possible(edges: np.ndarray, to_try: EdgePairsToTry, device_m: np.ndarray,
         for k in range(len(edges)):
             is_open[k] = around_edge(edges, k, receiver_m[i, 0], receiver_m[i, 1],
                                      receiver_m[i, 2])[0]
-        for j in range(seen):
+        for j in range(first_edges):
             for row in range(to_try.first[j], to_try.first[j + 1]):
                 second = to_try.second[row]
                 if meets[row] and is_open[second] and _cone_meets(
@@ -143,16 +143,16 @@ def _solve(edges: np.ndarray, tried: np.ndarray, device_m: np.ndarray, receiver_
     points_m, possible = np.empty((len(tried), 4, 3)), np.empty(len(tried), dtype=np.int64)
     count = 0
     for i in range(len(tried)):
-        end_m, one, other = receiver_m[tried[i, 0]], tried[i, 1], tried[i, 2]
-        if not around_edge(edges, other, end_m[0], end_m[1], end_m[2])[0]:
+        end_m, first_edge, second_edge = receiver_m[tried[i, 0]], tried[i, 1], tried[i, 2]
+        if not around_edge(edges, second_edge, end_m[0], end_m[1], end_m[2])[0]:
             continue
-        s, t = shortest(edges[one], edges[other], device_m, end_m)
-        if not (0.0 < s < edges[one, LENGTH] and 0.0 < t < edges[other, LENGTH]):
+        s, t = shortest(edges[first_edge], edges[second_edge], device_m, end_m)
+        if not (0.0 < s < edges[first_edge, LENGTH] and 0.0 < t < edges[second_edge, LENGTH]):
             continue
-        first_m = edges[one, START:START + 3] + s * edges[one, ALONG:ALONG + 3]
-        second_m = edges[other, START:START + 3] + t * edges[other, ALONG:ALONG + 3]
-        if around_edge(edges, one, second_m[0], second_m[1], second_m[2])[0] \
-                and around_edge(edges, other, first_m[0], first_m[1], first_m[2])[0]:
+        first_m = edges[first_edge, START:START + 3] + s * edges[first_edge, ALONG:ALONG + 3]
+        second_m = edges[second_edge, START:START + 3] + t * edges[second_edge, ALONG:ALONG + 3]
+        if around_edge(edges, first_edge, second_m[0], second_m[1], second_m[2])[0] \
+                and around_edge(edges, second_edge, first_m[0], first_m[1], first_m[2])[0]:
             points_m[i, 0], points_m[i, 1] = device_m, first_m
             points_m[i, 2], points_m[i, 3] = second_m, end_m
             possible[count] = i
