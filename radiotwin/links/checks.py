@@ -222,13 +222,13 @@ def receiver_notes(receiver_m: np.ndarray, scene: Scene) -> list[str]:
     inside[known] = scene.city.inside(receiver_m[known])
     below[known] = inside[known] & scene.city.below_ground(receiver_m[known])
     inside &= ~below
-    deep = inside.copy()
-    deep[inside] = chance_inside(scene.city, receiver_m[inside]) >= SURE
-    sure = f"{deep.sum():,} of them surely, with positions off by {POSITION_SD_M:g} m"
-    return [f"{odd.sum():,} of {len(odd):,} links have their receiver {where}"
-            for odd, where in ((inside, f"inside a building ({sure}): {INDOORS}"),
-                               (below, f"below the ground: {BURIED}"))
-            if odd.any()] + height_notes(receiver_m, scene)
+    surely = inside.copy()
+    surely[inside] = chance_inside(scene.city, receiver_m[inside]) >= SURE
+    sure = f"{surely.sum():,} of them surely, with positions off by {POSITION_SD_M:g} m"
+    return [f"{rows.sum():,} of {len(rows):,} links have their receiver {where}"
+            for rows, where in ((inside, f"inside a building ({sure}): {INDOORS}"),
+                                (below, f"below the ground: {BURIED}"))
+            if rows.any()] + height_notes(receiver_m, scene)
 
 
 def move_anchors_out(links: Links, scene: Scene, refuse: bool = True) -> Links:

@@ -122,10 +122,10 @@ class Trend:
         basis, distance_m = self.basis[nodes].astype(np.float32), _distance_m(part_m, i, j)
         for length_m in lengths_m.astype(np.float32):
             common = np.exp(to_nodes_m / -length_m) @ basis * weight
-            both = basis.T @ np.exp(between_m / -length_m) @ basis
+            projected = basis.T @ np.exp(between_m / -length_m) @ basis
             found.append(1 - np.exp(-distance_m / length_m)
                          - (step * (common[a] - common[b])).sum(axis=1)
-                         + 0.5 * weight**2 * ((step @ both) * step).sum(axis=1))
+                         + 0.5 * weight**2 * ((step @ projected) * step).sum(axis=1))
         return np.array(found)
 
 

@@ -190,8 +190,8 @@ def radios_of(devices: pd.DataFrame, patterns: dict[str, Pattern], scene: Scene 
               ) -> tuple[Radio, ...]:
     """Read the radio of each of k devices from their table; empty if nothing is declared.
 
-    A device whose row names no antenna has that of the scene. `patterns` are those of the files in
-    the column `antenna`. BadInput if a power contradicts an EIRP, or a pattern is missing.
+    A device whose row names no antenna has that of the scene. `patterns`: file in column `antenna`
+    -> pattern. BadInput if a power contradicts an EIRP, or a pattern is missing.
     """
     of_scene: dict[str, Antenna | None] = {}
     if scene is not None:
@@ -283,16 +283,16 @@ def match_learnt_law(names: Sequence[str], declared: Declared, learnt: Declared,
 
 
 def _with_powers(names: Sequence[str], radios: tuple[Radio, ...], known_dbm: list[float],
-                 whose: str, scene: Scene | None) -> tuple[tuple[Radio, ...], list[str]]:
+                 source: str, scene: Scene | None) -> tuple[tuple[Radio, ...], list[str]]:
     """Fill in missing transmit powers [dBm], with a note: the scene's power, else a median.
 
-    It is the median of `known_dbm`, which the note calls `whose`; `names` are those of the devices.
+    The median is that of `known_dbm`, which the note calls `source`; `names` are of the devices.
     """
     usual_dbm = float(np.median(known_dbm))
     if scene is not None and scene.config.radio.declares_power:
-        usual_dbm, whose = scene.config.radio.tx_power_dbm, "the scene's tx_power_dbm"
+        usual_dbm, source = scene.config.radio.tx_power_dbm, "the scene's tx_power_dbm"
     notes = _missing(names, radios, lambda radio: radio.tx_power_dbm is None, "tx_power_dbm of {} "
-                     f"is not declared and taken for {usual_dbm:g} dBm, {whose}")
+                     f"is not declared and taken for {usual_dbm:g} dBm, {source}")
     return tuple(replace(radio, tx_power_dbm=usual_dbm) if radio.tx_power_dbm is None else radio
                  for radio in radios), notes
 

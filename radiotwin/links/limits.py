@@ -166,20 +166,20 @@ def _log_likelihoods(tried_db: np.ndarray, read_db: np.ndarray, mean_db: np.ndar
     """
     readings, blanks = len(read_db), len(mean_db)
     mean_db = np.round(mean_db / BIN_DB) * BIN_DB
-    alike, times = np.unique(mean_db + 1j * scale_db, return_counts=True)
-    below = stdtr(DOF, (tried_db[:, None] - alike.real) / alike.imag)
+    predicted, times = np.unique(mean_db + 1j * scale_db, return_counts=True)
+    below = stdtr(DOF, (tried_db[:, None] - predicted.real) / predicted.imag)
     share = blanks / (readings + blanks)
     lost = np.array(LOST_SHARES) * share
     of_blanks = np.array([np.log(p + (1 - p) * below) @ times for p in lost])
     of_blanks += readings * np.log1p(-lost)[:, None]
-    near, times = np.unique(np.round(read_db[read_db < tried_db.max() + 4 * max(WIDTHS_DB)]
-                                     / FINE_DB) * FINE_DB, return_counts=True)
+    levels_db, times = np.unique(np.round(read_db[read_db < tried_db.max() + 4 * max(WIDTHS_DB)]
+                                          / FINE_DB) * FINE_DB, return_counts=True)
     of_readings = np.array([
-        np.log(OUTLIER + (1 - OUTLIER) * ndtr((near - tried_db[:, None]) / width)) @ times
+        np.log(OUTLIER + (1 - OUTLIER) * ndtr((levels_db - tried_db[:, None]) / width)) @ times
         for width in WIDTHS_DB])
-    both = (of_readings[:, None] + of_blanks) / links_per_observation
+    log_likelihood = (of_readings[:, None] + of_blanks) / links_per_observation
     prior = np.array(WIDTH_SHARES)[:, None, None] / len(lost)
-    nats = logsumexp(both, axis=(0, 1), b=prior)
+    nats = logsumexp(log_likelihood, axis=(0, 1), b=prior)
     return nats, (blanks * np.log(share) + readings * np.log1p(-share)) / links_per_observation
 
 
@@ -326,11 +326,11 @@ def _notes(links: Links, rows: list[np.ndarray], limits_db: np.ndarray,
         level_db = links.level_db[np.concatenate([rows[r] for r in other])]
         read_db = level_db[np.isfinite(level_db)]
         below = int((read_db < declared_db).sum())
-        lie = "no reading lies near it"
+        fact = "no reading lies near it"
         if below:
-            lie = (f"{below:,} of {len(read_db):,} readings ({percent(below / len(read_db))}) lie "
-                   f"below it, down to {read_db.min():g}")
-        notes.append(f"{_declared_text(links, declared_db)} does not fit the readings: {lie}. "
+            fact = (f"{below:,} of {len(read_db):,} readings ({percent(below / len(read_db))}) lie "
+                    f"below it, down to {read_db.min():g}")
+        notes.append(f"{_declared_text(links, declared_db)} does not fit the readings: {fact}. "
                      f"{_used_instead(links, limits_db, found, other)}")
     elif len(known_db) and np.ptp(known_db) > DIFFER_DB:
         low, high = (links.receiver_names[int(np.flatnonzero(limits_db == end)[0])]

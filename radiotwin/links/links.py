@@ -557,7 +557,7 @@ class Links:
                                declared=self.declared.of_devices(radio), reads=reads)
 
     def with_located_devices(self, device_m: np.ndarray) -> Links:
-        """Place the devices at (k, 3) [m], and drop the links of those at NaN."""
+        """Place the devices at (k, 3) [m], and drop the links of devices at NaN."""
         rows = np.isfinite(device_m).all(axis=1)[self.device]
         return self.with_devices(np.nan_to_num(device_m)).select(rows)
 

@@ -62,8 +62,8 @@ def antenna_of(links: Links, device: int) -> list[int]:
 def relatives_of(links: Links, device: int, heard: set[int]) -> list[int]:
     """Return up to `MAX_RELATIVES` detected devices with nearly the same paths as a given device.
 
-    They are the other devices of its antenna; if none of these was detected, those of its mast.
-    `heard` are the indices of detected devices.
+    They are other devices of the same antenna, or if none was detected, of the same mast. `heard`
+    are the indices of detected devices.
     """
     others = ([other for other in group if other != device and other in heard]
               for group in (antenna_of(links, device), site_of(links, device)))
@@ -157,7 +157,7 @@ def inseparable_end(links: Links, end: str, members: set[int]) -> str | None:
 
 
 def end_notes(links: Links) -> list[str]:
-    """Note devices that may be two transmitters, and those that only one receiver or flight has."""
+    """Note devices that may be two transmitters, or have the same links as a receiver or flight."""
     notes = [f"device {links.device_names[device]} may be two transmitters of one name, such as "
              f"cells of one identity or carriers of a cell: {why}; if so, give each its name"
              for device, why in shared_names(links).items()]
@@ -181,7 +181,7 @@ class ReceiverDifference:
         first, second: indices of the receivers.
         difference_db: reading of the second minus that of the first [dB].
         low_db, high_db: 90 % interval [dB], the wider of those clustered by place and by device.
-        pairs: number of readings of the first with one of the second beside them.
+        pairs: number of pairs of readings, one of each receiver, within `SAME_M`.
         places: number of squares of ground with pairs, summed over the devices.
     """
 

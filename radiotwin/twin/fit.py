@@ -162,18 +162,18 @@ def _thinned(measurements: Measurements, seed: int) -> Measurements:
     if len(device) <= MAX_LINKS:
         return measurements
     links = np.bincount(device)
-    few, many = 1, len(device)  # links of a device: the first fits into MAX_LINKS, the second not
-    while many - few > 1:
-        middle = (few + many) // 2
+    quota, too_many = 1, len(device)  # of a device: fits into MAX_LINKS, or not
+    while too_many - quota > 1:
+        middle = (quota + too_many) // 2
         fits = np.minimum(links, middle).sum() <= max(MAX_LINKS, len(links))
-        few, many = (middle, many) if fits else (few, middle)
+        quota, too_many = (middle, too_many) if fits else (quota, middle)
     shuffled = np.random.default_rng(seed).permutation(len(device))
     by_device = shuffled[np.argsort(device[shuffled], kind="stable")]
     number = np.arange(len(device)) - np.repeat(np.cumsum(links) - links, links)
     keep = np.zeros(len(device), dtype=bool)
-    keep[by_device[number < few]] = True
+    keep[by_device[number < quota]] = True
     warnings.warn(f"{len(device):,} links were measured, {keep.sum():,} of them are fitted: at "
-                  f"most {few:,} of each device, drawn at random; the result is as certain as so "
+                  f"most {quota:,} of each device, drawn at random; the result is as certain as so "
                   "many links make it", stacklevel=3)
     return measurements.select(keep)
 

@@ -156,8 +156,8 @@ def _locate(links: Links, scene: Scene, channel: ChannelModel, law_error: LawErr
     """Locate the devices `unknown` (k,) by a fitted channel, or load an earlier result."""
     start_m = None
     if start is not None:
-        before = {device.device: (device.x_m, device.y_m) for device in start.devices}
-        start_m = np.array([before.get(links.device_names[i], (np.nan, np.nan)) for i in unknown])
+        earlier = {device.device: (device.x_m, device.y_m) for device in start.devices}
+        start_m = np.array([earlier.get(links.device_names[i], (np.nan, np.nan)) for i in unknown])
     # A position may be heard by several receivers: below the highest of their limits is all that
     # blanks of each surely are.
     known = np.isfinite(links.limit_db)

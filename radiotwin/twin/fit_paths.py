@@ -100,8 +100,8 @@ def relocation_from(scene: Scene, max_radius_m: float, start: Twin | None = None
                     executor: Executor | None = None) -> Relocation:
     """Set up a search for unknown devices by tracing paths.
 
-    Devices with a 90 % radius by the law above `max_radius_m` [m] are not searched; those with a
-    small radius in an earlier twin only around their positions in it and by the law.
+    Devices with a 90 % radius by the law above `max_radius_m` [m] are not searched. A device that
+    `start` located within `SURE_M` is searched only around that position and the law's.
     """
     sure = [device for device in start.devices if device.role == "unknown" and device.located
             and device.credible_radius_m <= SURE_M] if start else []
@@ -199,7 +199,7 @@ def _with_copies(links: Links) -> Links:
 
 
 def _calibrated(devices: list[TwinDevice], links: Links) -> list[TwinDevice]:
-    """Drop the copies of anchors, and scale all radii by how far they were located from these.
+    """Drop the copies of anchors, and scale all radii by the position errors of the copies.
 
     A normal distribution with 90 % radius r has the mean square error r² / ln 10. The factor is at
     least 1.

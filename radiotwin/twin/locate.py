@@ -115,11 +115,11 @@ def locate_devices(measurements: Measurements | pd.DataFrame | Path | str, twin:
 
 def _with_receivers_of(links: Links, names: Sequence[str]) -> Links:
     """Renumber the receivers of links by their index in `names`, which has all of them."""
-    place = {name: i for i, name in reversed(list(enumerate(names)))}
-    number = np.array([place[name] for name in links.receiver_names])
-    tracks = {(int(number[receiver]), flight): track
+    index_of = {name: i for i, name in reversed(list(enumerate(names)))}
+    new_index = np.array([index_of[name] for name in links.receiver_names])
+    tracks = {(int(new_index[receiver]), flight): track
               for (receiver, flight), track in links.tracks.items()}
-    return links.with_columns(receiver=number[links.receiver]).with_ends(
+    return links.with_columns(receiver=new_index[links.receiver]).with_ends(
         receiver_names=list(names), flown=replace(links.ends.flown, tracks=tracks))
 
 

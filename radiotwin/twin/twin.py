@@ -203,7 +203,7 @@ class Twin(Summarised):
 
     def links(self, receiver_m: np.ndarray, device: np.ndarray, scene: Scene | None = None
               ) -> Links:
-        """Make links to predict, without receivers, flights, times; unknown positions are at 0.
+        """Make links to predict, without receivers, flights, times; devices at NaN go to 0, 0, 0.
 
         Args:
             receiver_m: (n, 3) positions of the receivers [m].
@@ -299,9 +299,9 @@ class Twin(Summarised):
 
     def _predict(self, links: Links) -> Prediction:
         """Predict links in chunks, to bound memory."""
-        size = CHUNK if self.fitted.is_channel_alone else CHUNK_WITH_EFFECTS
-        chunks = [links] if len(links) <= size else [
-            links.select(slice(start, start + size)) for start in range(0, len(links), size)]
+        length = CHUNK if self.fitted.is_channel_alone else CHUNK_WITH_EFFECTS
+        chunks = [links] if len(links) <= length else [
+            links.select(slice(start, start + length)) for start in range(0, len(links), length)]
         return Prediction.concatenate([self.fitted.predict(chunk) for chunk in chunks])
 
     def radio_map(self, scene: Scene | Path | str | None = None) -> RadioMap:

@@ -64,23 +64,23 @@ def followed_since(known: dict[tuple[float, ...], int], followed: Followed
     """Return path powers cached since each position had `known` links, as arrays for a file."""
     new = {position_m: list(powers.items())[known.get(position_m, 0):]
            for position_m, powers in followed.items() if len(powers) > known.get(position_m, 0)}
-    ends = [end for powers in new.values() for end in powers]
+    entries = [entry for powers in new.values() for entry in powers]
     return {"position_m": np.array(list(new)).reshape(-1, 3),
             "count": np.array([len(powers) for powers in new.values()], dtype=int),
-            "hash": np.array([key for key, _ in ends], dtype=np.uint64),
-            "power": np.array([power for _, power in ends], dtype=float)}
+            "hash": np.array([key for key, _ in entries], dtype=np.uint64),
+            "power": np.array([power for _, power in entries], dtype=float)}
 
 
 def add_followed(arrays: dict[str, np.ndarray], followed: Followed) -> None:
     """Add path powers from `followed_since` to a cache in place; ValueError if damaged."""
-    ends = list(zip(arrays["hash"].tolist(), arrays["power"].tolist(), strict=True))
-    if arrays["count"].sum() != len(ends):
+    entries = list(zip(arrays["hash"].tolist(), arrays["power"].tolist(), strict=True))
+    if arrays["count"].sum() != len(entries):
         raise ValueError("counts do not match the entries")
     last = np.cumsum(arrays["count"]).tolist()
     for position_m, end, count in zip(arrays["position_m"].tolist(), last,
                                       arrays["count"].tolist(), strict=True):
         if count:
-            followed.setdefault(tuple(position_m), {}).update(ends[end - count:end])
+            followed.setdefault(tuple(position_m), {}).update(entries[end - count:end])
 
 
 @dataclass(eq=False)
@@ -323,7 +323,7 @@ class _Search:
                        second_mode=None)
 
     def _likely_cells(self, device: TwinDevice) -> list[np.ndarray]:
-        """Return those cell centres (2,) [m] around a device that the log-distance law favours."""
+        """Return the cell centres (2,) [m] around a device that the law makes likeliest, apart."""
         start_m = np.array([device.x_m, device.y_m])
         reach_m = max(REACH_RADII * device.credible_radius_m, MIN_REACH_M)
         cells_m = self._free(_cells(start_m, reach_m, self.relocation.bounds))

@@ -226,11 +226,11 @@ class Likelihood:
         total = np.zeros((len(observed), len(xy_m)))
         step = max(1, CHUNK_LINKS // max(len(rows), 1))
         for part in (slice(start, start + step) for start in range(0, len(xy_m), step)):
-            los, link = self._line_of_sight(xy_m[part], rows), None
+            los, predicted = self._line_of_sight(xy_m[part], rows), None
             for i, data in enumerate(observed):
-                if link is None or self.channel.by_device:
-                    link = self.channel.look_up(xy_m[part], rows, los, data.device)
-                mean_db, sd_db = link
+                if predicted is None or self.channel.by_device:
+                    predicted = self.channel.look_up(xy_m[part], rows, los, data.device)
+                mean_db, sd_db = predicted
                 mean_db = self._with_declared(mean_db, xy_m[part], rows, data.device)
                 total[i, part] = self._score(data, rows, mean_db, sd_db)
         return total

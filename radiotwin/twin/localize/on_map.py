@@ -134,23 +134,23 @@ class Search:
         links = self.settings.scan_links // (DIRECT_SAVING if is_direct else 1)
         area = (x_max - x_min) * (y_max - y_min)
         receivers = len(self.likelihood.observations.receiver_m)
-        width = max(self.settings.scan_step_m, np.sqrt(area * receivers / links)) * coarser
-        axes = _centres(x_min, x_max, width), _centres(y_min, y_max, width)
-        centre = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-        point, placed = centre.copy(), np.zeros(len(centre), bool)
-        for offset in POINTS_OF_CELL * width:
+        width_m = max(self.settings.scan_step_m, np.sqrt(area * receivers / links)) * coarser
+        axes = _centres(x_min, x_max, width_m), _centres(y_min, y_max, width_m)
+        centre_m = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+        point_m, placed = centre_m.copy(), np.zeros(len(centre_m), bool)
+        for offset in POINTS_OF_CELL * width_m:
             todo = np.flatnonzero(~placed)
-            tried = centre[todo] + offset
-            good = self.allowed(tried)
-            point[todo[good]], placed[todo[good]] = tried[good], True
+            tried = centre_m[todo] + offset
+            free = self.allowed(tried)
+            point_m[todo[free]], placed[todo[free]] = tried[free], True
         if not placed.any():
             raise BadInput(
                 f"no position for a device at height {self.likelihood.z_m} m within x {x_min} … "
                 f"{x_max} and y {y_min} … {y_max} m: all of it is inside buildings; widen the "
                 "bounds, check the heights, or set allow_indoor")
-        centre, point = centre[placed], point[placed]
-        return Scan(centre, width, point,
-                    self.likelihood.of_devices(self.likelihood.devices, point))
+        centre_m, point_m = centre_m[placed], point_m[placed]
+        return Scan(centre_m, width_m, point_m,
+                    self.likelihood.of_devices(self.likelihood.devices, point_m))
 
 
 def _centres(low: float, high: float, width: float) -> np.ndarray:
@@ -302,7 +302,7 @@ def _run_swarms(searches: list[Search], scans: list[Scan], start_m: np.ndarray,
     Likely are distinct modes of the scan, and an earlier estimate in `start_m`.
     """
     search_of = {k: search for search in searches for k in search.likelihood.devices}
-    centres, whose = [], []
+    centres, device_of = [], []
     for search, scan in zip(searches, scans, strict=True):
         for k, value in zip(search.likelihood.devices, scan.value, strict=True):
             modes = distinct_modes(scan.point_m, value, settings.swarms,
@@ -310,7 +310,7 @@ def _run_swarms(searches: list[Search], scans: list[Scan], start_m: np.ndarray,
             if np.isfinite(start_m[k]).all():
                 modes = np.vstack([modes, start_m[k]])
             centres.append(modes)
-            whose.append(np.full(len(modes), k))
+            device_of.append(np.full(len(modes), k))
 
     def log_likelihood(xy_m: np.ndarray, device: np.ndarray) -> np.ndarray:
         value = np.empty(len(xy_m))
@@ -318,7 +318,7 @@ def _run_swarms(searches: list[Search], scans: list[Scan], start_m: np.ndarray,
             value[device == k] = search_of[k].log_likelihood(k, xy_m[device == k])
         return value
 
-    devices = np.concatenate(whose)
+    devices = np.concatenate(device_of)
     best_m, value = swarm_search(
         log_likelihood, np.concatenate(centres), devices, scans[0].point_m, scans[0].width_m,
         settings.particles, settings.iterations, rng, advance)
@@ -330,11 +330,11 @@ def _estimate(data: DeviceObservations, name: str, z_m: float,
               found: tuple[Posterior, Search] | None) -> TwinDevice:
     """Return a device with position, 90 % radius and second mode; `found` None: without data."""
     x_m = y_m = np.nan
-    radius_m, other, located = np.inf, None, False
+    radius_m, second, located = np.inf, None, False
     if found is not None:
         posterior, search = found
         modes = posterior.modes(search.allowed)
         x_m, y_m = map(float, modes[0][0])
-        radius_m, other = posterior.radius(modes[0][0]), second_mode(modes)
+        radius_m, second = posterior.radius(modes[0][0]), second_mode(modes)
         located = len(data.seen) > 0 and posterior.region_share() < VAGUE_SHARE
-    return TwinDevice(name, x_m, y_m, float(z_m), "unknown", located, radius_m, other)
+    return TwinDevice(name, x_m, y_m, float(z_m), "unknown", located, radius_m, second)

@@ -142,9 +142,9 @@ def fit_elsewhere(model: FittedModel, device_links: Links, positions_m: np.ndarr
 def _finer(log_likelihood: np.ndarray, power: float, coarse_m: np.ndarray,
            width_m: float) -> tuple[np.ndarray, float]:
     """Split the coarse cells that hold the probability HELD; return fine ones (c, 2), width [m]."""
-    share = _normalised(power * log_likelihood)
-    order = np.argsort(-share)
-    held = order[:int(np.searchsorted(np.cumsum(share[order]), HELD)) + 1]
+    probability = _normalised(power * log_likelihood)
+    order = np.argsort(-probability)
+    held = order[:int(np.searchsorted(np.cumsum(probability[order]), HELD)) + 1]
     split = int(np.clip(np.sqrt(MAX_FINE_CELLS / len(held)), 1, MAX_SPLIT))
     steps_m = (np.arange(split) + 0.5) * width_m / split - width_m / 2
     around_m = np.stack(np.meshgrid(steps_m, steps_m), axis=-1).reshape(-1, 2)

@@ -52,8 +52,8 @@ def refine(fit: Fit, evaluations: int = EVALUATIONS, descents: int = DESCENTS,
         return fit
     if variation.members is not None:
         return _refine_members(fit, last, variation)
-    train, near = model.train, last.reach(model.links)
-    train = train if near is None else train & near
+    train, reached = model.train, last.reach(model.links)
+    train = train if reached is None else train & reached
     rows = subsample(np.flatnonzero(train), max_links)
     if not len(rows):
         return fit
@@ -101,13 +101,13 @@ def _refine_members(fit: Fit, last: Effect, variation: Variation) -> Fit:
         effect = variation.effect(np.clip(numbers, variation.low, variation.high))
         return effect, effect.term(links, model.level_at)
 
-    def acted_db(links: Links, numbers: np.ndarray) -> np.ndarray:
+    def effect_db(links: Links, numbers: np.ndarray) -> np.ndarray:
         effect, term = changed(links, numbers)
         if effect.stage != "receiver":
             return term.offset_db
-        through = response([(effect, term.inputs)])
-        assert through is not None
-        return sum((through(np.full(len(links), level_db))[0] for level_db in EXTREMES_DB),
+        respond = response([(effect, term.inputs)])
+        assert respond is not None
+        return sum((respond(np.full(len(links), level_db))[0] for level_db in EXTREMES_DB),
                    start=np.zeros(len(links)))
 
     train_rows = np.flatnonzero(model.train)
@@ -115,8 +115,8 @@ def _refine_members(fit: Fit, last: Effect, variation: Variation) -> Fit:
     for member in variation.members or ():
         moved, step = numbers.copy(), variation.steps[member]
         moved[member] += np.where(numbers[member] + step > variation.high[member], -step, step)
-        acts = acted_db(trained, moved) != acted_db(trained, numbers)
-        rows = subsample(train_rows[acts], MAX_LINKS_OF_MEMBER)
+        affected = effect_db(trained, moved) != effect_db(trained, numbers)
+        rows = subsample(train_rows[affected], MAX_LINKS_OF_MEMBER)
         if not len(rows):
             continue
         latest = None

@@ -300,8 +300,8 @@ class Fit(FitResult):
         if all(term.unheard_sd_db is None for term in self.model.terms):
             return mean_db, total_db, np.zeros(len(total_db))
         scatter_sd_db = self.model._scatter_sd_db(slice(None))
-        heard = replace(self.model.regression(), random_effect_sd_db=scatter_sd_db)
-        scale_db = heard.predict(self).scale_db
+        problem = replace(self.model.regression(), random_effect_sd_db=scatter_sd_db)
+        scale_db = problem.predict(self).scale_db
         return mean_db, scale_db, np.sqrt(np.maximum(total_db**2 - scale_db**2, 0.0))
 
 
@@ -347,7 +347,7 @@ class Unheard:
     """Population of device offsets: what to expect of devices without a reading.
 
     Attributes:
-        devices: rows, at the fit, of devices without a reading and without a declared antenna.
+        devices: rows, at the fit, of devices without training link and without declared antenna.
         mean_db: mean over the other devices of what device effects add to their links [dB].
         sd_db: standard deviation of that over links and devices, with the device's own level [dB].
     """
@@ -358,7 +358,7 @@ class Unheard:
 
     @classmethod
     def of(cls, fit: Fit, device_sd_db: float) -> Unheard | None:
-        """Estimate mean and spread of the other devices' offsets; None: all were heard."""
+        """Estimate mean and spread of trained devices' offsets; None: no other device, or none."""
         links, device_db, declared = fit.links, np.zeros(len(fit.links)), set[int]()
         for number, (effect, term) in enumerate(zip(fit.effects, fit.model.terms, strict=True)):
             if effect.is_declared:
@@ -366,12 +366,12 @@ class Unheard:
             elif effect.of_device:
                 device_db += term.offset_db + term.columns @ fit.coefficients_of(number)
         device = links.device[fit.train]
-        heard = np.unique(device)
-        devices = sorted(set(range(len(links.device_m))) - set(heard.tolist()) - declared)
-        if not devices or not len(heard):
+        trained = np.unique(device)
+        devices = sorted(set(range(len(links.device_m))) - set(trained.tolist()) - declared)
+        if not devices or not len(trained):
             return None
         # Each device counts the same, however many readings it has.
-        weight = 1.0 / np.bincount(device)[device] / len(heard)
+        weight = 1.0 / np.bincount(device)[device] / len(trained)
         mean_db = float(weight @ device_db[fit.train])
         spread_db = np.sqrt(weight @ (device_db[fit.train] - mean_db) ** 2)
         return cls(tuple(devices), mean_db, float(np.hypot(spread_db, device_sd_db)))

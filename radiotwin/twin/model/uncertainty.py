@@ -87,7 +87,7 @@ def linearise(fit: Fit, known: Mapping[int, list[ReadingDerivative]] | None = No
 
 
 def estimates(linearised: Linearised) -> list[Estimate]:
-    """Return coefficients, covariances and parameter sds of each effect (cluster-robust).
+    """Return coefficients, cluster-robust covariances, parameter sds (below, above) of each effect.
 
     Clusters of correlated errors are blocks of ground, places, and flights; the largest variance
     over these clusterings counts.
@@ -161,8 +161,8 @@ def _derivative(fit: Fit, number: int, variation: Variation, i: int, step: float
         moved_by = numbers[i] - variation.values[i]
         if moved_by == 0:
             continue
-        other = variation.effect(numbers)
-        moved = model.with_effect_at(number, other).training
+        varied = variation.effect(numbers)
+        moved = model.with_effect_at(number, varied).training
         after = moved.predict(fit)
         change = np.zeros((3, n))
         if blanking:
@@ -171,7 +171,7 @@ def _derivative(fit: Fit, number: int, variation: Variation, i: int, step: float
             change[0] = after.mean_db - predicted.mean_db
             change[1] = np.log(after.scale_db / predicted.scale_db)
         sides.append(change / moved_by)
-        priors.append(other.neg_log_prior() - prior)
+        priors.append(varied.neg_log_prior() - prior)
     if not sides:
         return ReadingDerivative(np.zeros(n), np.zeros(n), np.zeros(n))
     mean_db, log_scale, score = np.mean(sides, axis=0)
@@ -204,10 +204,10 @@ def _curvatures(problem: CensoredRegression, predicted: Linearisation,
     """
     slope, curvature, scale_slope = problem.reading_law(
         predicted.mean_db, predicted.scale_db).derivatives(problem.level_db)
-    seen = np.isfinite(problem.level_db)
+    detected = np.isfinite(problem.level_db)
     expected = (problem.dof + 1) / (problem.dof + 3) / predicted.scale_db**2
-    return (slope, scale_slope, np.where(seen, expected, curvature),
-            2 * problem.dof / (problem.dof + 3) * seen)
+    return (slope, scale_slope, np.where(detected, expected, curvature),
+            2 * problem.dof / (problem.dof + 3) * detected)
 
 
 def _scores(fit: Fit, derivatives: list[ReadingDerivative], design_effect: float) -> Scores:
