@@ -33,7 +33,7 @@ Response = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 def design(blocks: list[np.ndarray], n: int) -> np.ndarray | csr_array:
-    """Stack columns (n, …) side by side into a design matrix; sparse if most entries are zero."""
+    """Stack columns (n, …) into a design matrix; sparse if below MAX_DENSITY are not zero."""
     columns = np.hstack([np.zeros((n, 0)), *blocks])
     sparse = np.count_nonzero(columns) < MAX_DENSITY * columns.size
     return csr_array(columns) if sparse else columns
