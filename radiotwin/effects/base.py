@@ -341,7 +341,7 @@ class Effect(ABC):
         return None
 
     def rivals(self, links: Links, parameters: Mapping[str, Parameter]) -> list[str]:
-        """List the effects that would explain these links equally well by name; default: none.
+        """List by name the effects that would explain these links equally well; default: none.
 
         E.g. an offset of a device that only one receiver heard may as well be that receiver's.
 
@@ -411,7 +411,7 @@ class _ResponseEffect(Effect):
         raise NotImplementedError(f"{type(self).__name__} defines neither inputs nor term")
 
     def response(self, level_db: np.ndarray, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Map the mean levels that enter this stage of reception to those that leave it.
+        """Map the mean levels before this stage of reception to the levels after it.
 
         Args:
             level_db: (n,) level that enters [dB].

@@ -177,8 +177,8 @@ def _shares_within(start: float, step: float, half: float) -> tuple[float, float
     """Return from which to which fraction of a step a coordinate is in ±half; inf, -inf: never."""
     if abs(step) < 1e-9:  # at right angles to the axis: within all the way, or never
         return (-np.inf, np.inf) if abs(start) <= half else (np.inf, -np.inf)
-    one, other = (-half - start) / step, (half - start) / step
-    return min(one, other), max(one, other)
+    first, second = (-half - start) / step, (half - start) / step
+    return min(first, second), max(first, second)
 
 
 @njit(cache=True, error_model="numpy")
@@ -281,7 +281,7 @@ def back_project(a_m: np.ndarray, b_m: np.ndarray,
         nats: (n,) log-likelihood gain if the link is obstructed, see `obstruction_nats`.
 
     Returns:
-        (m, 2) centres of the cells [m], and (m, heights) sum over the links that pass each cell
+        (m, 2) centres of the cells [m], and (m, heights) sum over the links that cross each cell
         below each of `HEIGHTS_M` [nats].
     """
     low = np.floor(np.minimum(a_m, b_m)[:, :2].min(axis=0) / CELL_M).astype(int)

@@ -55,14 +55,14 @@ def register(effect: type[Effect]) -> type[Effect]:
     """Add an effect class to the catalogue of this process; usable as a decorator.
 
     Raises:
-        BadInput: it is not an effect, or its name and variant are taken.
+        BadInput: it is not an effect, or its name and variant are in use.
     """
     if not (isinstance(effect, type) and issubclass(effect, Effect)):
         raise BadInput(f"{effect!r} is not a subclass of radiotwin.effects.Effect")
     if effect not in _registered:
-        taken = {(other.name, other.variant): other for other in (*BUILT_IN, *_registered)}
-        if (effect.name, effect.variant) in taken:
-            other = taken[effect.name, effect.variant]
+        known = {(other.name, other.variant): other for other in (*BUILT_IN, *_registered)}
+        if (effect.name, effect.variant) in known:
+            other = known[effect.name, effect.variant]
             raise BadInput(
                 f"the effect {effect.name!r} ({effect.variant!r}) of {effect.__module__} is in "
                 f"{other.__module__} already; give it another name or variant")

@@ -275,7 +275,7 @@ def build_scene(source: Path | str, out_folder: Path | str, options: BuildOption
     Args:
         source: Path of a Mitsuba or Sionna RT XML file, or `sionna:NAME`.
         out_folder: Scene folder to write; a scene that is already in it is replaced.
-        options: How to read the city, and what to add to it; without those for maps.
+        options: How to read the city, and what to add to it; options for maps are ignored.
         check_only: Write nothing, and return errors in the report instead of raising them.
 
     Returns:
@@ -391,7 +391,7 @@ def write_scene(folder: Path, shapes: list[CityShape], config: SceneConfig,
 
 def _city_shapes(city: ImportedCity, frequency_hz: float
                  ) -> tuple[list[CityShape], list[Problem]]:
-    """Return a city's shapes with materials that Sionna RT accepts, and notes of those changed."""
+    """Return a city's shapes with materials that Sionna RT accepts, and what was changed."""
     assert city.surfaces is not None  # without an error among the problems
     materials = [material for material in city.materials if material is not None]
     taken = Names(name.lower() for name in city.names)

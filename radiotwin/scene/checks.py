@@ -62,14 +62,14 @@ def check_up_axis(surfaces: Surfaces, ground: np.ndarray) -> list[Problem]:
     """
     if ground.any():
         return []
-    size = np.ptp(surfaces.vertices, axis=0)
+    sides = np.ptp(surfaces.vertices, axis=0)
     for index, axis in ((1, "y"), (0, "x")):
         turned = Surfaces([(upright(surfaces.vertices, axis), surfaces.faces)])
-        on_side = surfaces.parts >= 5 and size[index] < 0.5 * np.delete(size, index).min()
+        on_side = surfaces.parts >= 5 and sides[index] < 0.5 * np.delete(sides, index).min()
         if on_side or _has_ground_below(turned):
             return [error(f"the axis {axis} seems to point up, not z (the city measures "
-                          f"{size[0]:.4g} × {size[1]:.4g} × {size[2]:.4g} along x, y, z); turn it "
-                          f"with --up {axis}, or keep it as it is with --up z")]
+                          f"{sides[0]:.4g} × {sides[1]:.4g} × {sides[2]:.4g} along x, y, z); "
+                          f"turn it with --up {axis}, or keep it as it is with --up z")]
     return []
 
 
@@ -79,14 +79,14 @@ def _has_ground_below(surfaces: Surfaces) -> bool:
     The level distinguishes ground from a flat surface high up, such as a screen in a room.
     """
     ground = surfaces.ground_faces()
-    size = np.ptp(surfaces.vertices, axis=0)
+    sides = np.ptp(surfaces.vertices, axis=0)
     covered = np.abs(surfaces.area_vectors[ground, 2]).sum()
-    if covered < 0.8 * size[0] * size[1] or not ground.any():
+    if covered < 0.8 * sides[0] * sides[1] or not ground.any():
         return False
     lowest = surfaces.vertices[:, 2].min()
     ground_lowest = surfaces.vertices[surfaces.faces[ground], 2].min()
-    return (ground_lowest <= lowest + 0.02 * size[2]
-            and surfaces.level_m(ground) < lowest + 0.4 * size[2])
+    return (ground_lowest <= lowest + 0.02 * sides[2]
+            and surfaces.level_m(ground) < lowest + 0.4 * sides[2])
 
 
 def check_units(surfaces: Surfaces) -> list[Problem]:

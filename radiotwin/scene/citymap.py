@@ -61,10 +61,7 @@ def _embree_scene(triangles: np.ndarray) -> Any:
 
 
 def _distinct(triangles: np.ndarray) -> np.ndarray:
-    """Return the indices of triangles (n, 3, 3), one of each set of equal ones (single precision).
-
-    Embree tests every duplicate of a triangle that a ray meets.
-    """
+    """Return indices of distinct triangles (n, 3, 3), float32: Embree tests every duplicate."""
     words = np.ascontiguousarray(triangles).reshape(len(triangles), 9).view(np.uint32)
     return np.flatnonzero(~pd.DataFrame(words).duplicated())
 
@@ -228,8 +225,8 @@ class CityMap:
         clear = np.ones(len(a_m), bool) if self.terrain is not None else \
             bend_m[..., 2].min(axis=0) >= np.minimum(a_m[:, 2], b_m[:, 2]).clip(None, 0)
         for start_m, end_m in zip(bend_m, bend_m[1:]):
-            left = np.flatnonzero(clear)
-            clear[left] = self.line_of_sight(start_m[left], end_m[left])
+            rows = np.flatnonzero(clear)
+            clear[rows] = self.line_of_sight(start_m[rows], end_m[rows])
         return clear
 
     def height_at(self, x_m: np.ndarray | float, y_m: np.ndarray | float) -> np.ndarray:

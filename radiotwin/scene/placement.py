@@ -234,7 +234,7 @@ def place_uavs(count: int, extent: Extent, lattice: LatticeConfig, buildings: Ci
         ground: Map without buildings that altitudes count from; None: they count from the datum.
 
     Raises:
-        BadInput: No lattice position is free at an altitude.
+        BadInput: None of the 10,000 nearest lattice positions is free at an altitude.
     """
     x_min, x_max, y_min, y_max = extent.bounds
     positions = Lattice.over(*extent.bounds, lattice.step_m, lattice.altitudes_m)

@@ -193,7 +193,7 @@ class Surfaces:
         return faces
 
     def level_m(self, faces: np.ndarray) -> float:
-        """Return the median height [m], weighted by area, of the faces (f,) bool that look up.
+        """Return the median height [m], weighted by area, of the faces (f,) bool that face up.
 
         If none of them does, all count.
         """

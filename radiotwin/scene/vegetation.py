@@ -73,13 +73,13 @@ class Vegetation:
         """
         _require_few_meetings([ring for config in declared for ring in config.rings_m])
         areas, heights_m, kinds = [], [], []
-        taken: BaseGeometry = shapely.MultiPolygon()
+        covered: BaseGeometry = shapely.MultiPolygon()
         for config in sorted(declared, key=lambda one: -one.height_m):
             outline, *holes = config.rings_m
             area = shapely.make_valid(shapely.Polygon(outline, holes))
             parts = [part for part in shapely.get_parts(shapely.get_parts(
-                shapely.difference(area, taken))) if part.geom_type == "Polygon"]
-            taken = shapely.union(taken, area)
+                shapely.difference(area, covered))) if part.geom_type == "Polygon"]
+            covered = shapely.union(covered, area)
             areas += parts
             heights_m += [config.height_m] * len(parts)
             kinds += [config.kind] * len(parts)

@@ -69,7 +69,7 @@ class OwnTurn(NamedTuple):
 
 
 def level_groups(links: Links, devices: list[int]) -> list[list[int]]:
-    """Group devices that share a mast, then those that share a direction (an antenna) of it.
+    """Group the devices of each mast, then the devices of each direction (antenna) of a mast.
 
     Only groups of two or more; a mast with one direction is listed twice.
     """
@@ -197,7 +197,7 @@ class DeclaredSectors(SectorEffect):
 
     @override
     def implausible(self, coefficients: np.ndarray) -> str | None:
-        """Return why declared azimuths are unusable (all far off alike, or many by themselves)."""
+        """Return why declared azimuths are unusable (large common error, many wrong); else None."""
         params = self.params
         if len(params.own_turns_deg) > len(params.devices) / 2:
             return (f"of {len(params.devices)} declared azimuths {len(params.own_turns_deg)} are "
@@ -259,7 +259,7 @@ class DeclaredSectors(SectorEffect):
 
     @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
-        """Report shape, common and single azimuth errors [deg], and each device's gain [dB]."""
+        """Report shape, azimuth errors [deg], and devices' gains over their common level [dB]."""
         values = self.variation().values
         reported = {name: Parameter.normal(value, sd, field["unit"], Allowed.of(field))
                     for (name, field), value, sd in zip(_searched_fields().items(), values,
@@ -410,7 +410,7 @@ class _Readings(NamedTuple):
 
     def best_shape(self, offset_deg: float, own_turns: dict[int, OwnTurn]
                    ) -> tuple[float, SectorPattern]:
-        """Return the likeliest trial pattern, after its gain over a constant level [nats]."""
+        """Return the gain over a constant level [nats] of the likeliest trial pattern, and it."""
         def rate_shape(width_deg: float, back_db: float, tilt_deg: float, vertical_deg: float
                        ) -> tuple[float, SectorPattern]:
             shape = SectorPattern(beamwidth_deg=width_deg, front_to_back_db=back_db,

@@ -304,8 +304,8 @@ def _offset_p_value(flight: _Flight, others: list[_Flight], kind: int, links: Li
 
 def is_first_or_last(receiver: int, flight: int, links: Links) -> bool:
     """Check whether a flight is the receiver's first or last; False if flights have no order."""
-    times = {number: time_s[0] for (index, number), (time_s, _) in links.tracks.items()
-             if index == receiver}
-    if links.time_restarts or flight not in times:
+    start_s = {number: time_s[0] for (index, number), (time_s, _) in links.tracks.items()
+               if index == receiver}
+    if links.time_restarts or flight not in start_s:
         return False
-    return times[flight] in (min(times.values()), max(times.values()))
+    return start_s[flight] in (min(start_s.values()), max(start_s.values()))

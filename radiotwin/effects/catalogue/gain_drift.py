@@ -342,6 +342,6 @@ def _step_sd_db(after: np.ndarray, flight: np.ndarray, residual_db: np.ndarray,
     mean = np.bincount(cell, weights=weight * residual_db) / mass
     later = np.bincount(cell, weights=weight * after) > 0.5 * mass
     counts = [max((later == which).sum(), 1) for which in (False, True)]
-    rest = mean - np.where(later, mean[later].mean(), mean[~later].mean())
+    deviation_db = mean - np.where(later, mean[later].mean(), mean[~later].mean())
     freedom = max(len(mean) - 2, 1)
-    return float(np.sqrt((rest**2).sum() / freedom * (1 / counts[0] + 1 / counts[1])))
+    return float(np.sqrt((deviation_db**2).sum() / freedom * (1 / counts[0] + 1 / counts[1])))

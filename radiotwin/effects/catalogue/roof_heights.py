@@ -199,8 +199,8 @@ class RoofHeights(GainEffect):
         rows, link = np.unique(crossings.link, return_inverse=True)
         if not len(rows):
             return Term.of_offset(offset_db)
-        others = _without(city, tuple(which.tolist()))
-        hidden = ~others.line_of_sight(ends_m[0][rows], ends_m[1][rows])
+        rest_of_city = _without(city, tuple(which.tolist()))
+        hidden = ~rest_of_city.line_of_sight(ends_m[0][rows], ends_m[1][rows])
         wavelength_m = speed_of_light / links.frequency_hz
         before_db, after_db = (np.where(hidden, HIDDEN_DB, 0.0) for _ in range(2))
         np.maximum.at(before_db, link, crossings.loss_db(0.0, wavelength_m))

@@ -65,17 +65,17 @@ class SectorAntenna(SectorEffect):
     @override
     def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:
         """Yield a loss of 1 dB behind the sector antenna of one device, for several devices."""
-        links, size = view.links, quantities(SectorPattern)["front_to_back_db"]
+        links, front_to_back = view.links, quantities(SectorPattern)["front_to_back_db"]
         for mask in members(links.device):
-            off = _signed_deg(links.azimuth_deg - median_azimuth_deg(links.azimuth_deg[mask]))
+            off_deg = _signed_deg(links.azimuth_deg - median_azimuth_deg(links.azimuth_deg[mask]))
             yield Pattern("direction", "dB",
                           f"front to back of one device, {TYPICAL_WIDTH_DEG:.0f}° wide",
-                          mask * -np.minimum(0.5 * (off / TYPICAL_WIDTH_DEG) ** 2, 1.0),
-                          low=size["low"], high=size["high"])
+                          mask * -np.minimum(0.5 * (off_deg / TYPICAL_WIDTH_DEG) ** 2, 1.0),
+                          low=front_to_back["low"], high=front_to_back["high"])
 
     @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
-        """Report each device's antenna pattern and gain [dB], with 90 % intervals."""
+        """Report each device's antenna pattern, and its gain over the channel's level [dB]."""
         reported: dict[str, Parameter] = {}
         patterns_sd = np.reshape(estimate.params_sd, (len(self.params.devices), -1))
         for number, (device, pattern) in enumerate(self.params.devices.items()):

@@ -100,7 +100,7 @@ class TiltedDipole(BodyFrameEffect):
 
     @override
     def best_pattern(self, view: ResidualView, rows: np.ndarray) -> DipoleParams | None:
-        """Find the trial tilt that fits best on straight lines; None if it gains little."""
+        """Find the trial tilt that fits best on straight lines; None if below `MIN_NATS`."""
         links = view.links.select(rows)
         length_m = np.linalg.norm(links.offset_m, axis=1, keepdims=True)
         ray = -(links.offset_m / np.maximum(length_m, 1e-9))

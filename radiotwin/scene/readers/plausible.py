@@ -47,8 +47,7 @@ def implausible_heights(buildings: Sequence[tuple[str, Height, BaseGeometry]],
     above `MAX_MEDIAN_M` or below the height of a room.
 
     Args:
-        buildings: name, height, footprint in the local frame [m]; of a name only the tallest part
-            counts, and default heights do not.
+        buildings: name, height, footprint [m]; the tallest of a name counts, defaults do not.
         columns: name of a building -> its tags.
     """
     tallest: dict[str, tuple[str, Height, BaseGeometry]] = {}
@@ -64,9 +63,9 @@ def implausible_heights(buildings: Sequence[tuple[str, Height, BaseGeometry]],
     bounds_m = shapely.bounds(footprints)
     # A building is at least as wide as its area over its diagonal: most need no exact width
     least_m = shapely.area(footprints) / np.hypot(*(bounds_m[:, 2:] - bounds_m[:, :2]).T)
-    wide_m = np.array([_width_m(footprint) if top_m > RARE_SLENDERNESS * low_m else math.inf
-                       for footprint, top_m, low_m in zip(footprints, tops_m, least_m)])
-    rare = (tops_m > RARE_M) | (tops_m > RARE_SLENDERNESS * np.maximum(wide_m, 1.0))
+    width_m = np.array([_width_m(footprint) if top_m > RARE_SLENDERNESS * low_m else math.inf
+                        for footprint, top_m, low_m in zip(footprints, tops_m, least_m)])
+    rare = (tops_m > RARE_M) | (tops_m > RARE_SLENDERNESS * np.maximum(width_m, 1.0))
     median_m = float(np.median(tops_m)) if len(tops_m) > 1 else ROOM_M
     is_tall = median_m > MAX_MEDIAN_M
     if median_m < ROOM_M:
