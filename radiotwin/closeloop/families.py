@@ -34,7 +34,7 @@ class Readings:
         device, receiver, flight: (n,) int indices into `names`.
         time_s: (n,) [s]; NaN if unknown.
         moving_m: (n, 3) position of the moving end of the link [m].
-        device_m, receiver_m: (n, 3) positions of both ends [m].
+        device_m, receiver_m: (n, 3) positions of both ends [m]; NaN if not located.
         angles_deg: (n,) "azimuth" and "elevation" at the device, "body azimuth" at the receiver
             [degree]; NaN if unknown.
         predicted_db: (n,) mean level, predicted as if there were no limit of detection [dB].

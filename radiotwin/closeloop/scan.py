@@ -232,26 +232,27 @@ class _ValuesOfOneSight:
                 usual_db = (LOS_CURVE_SHARE if self.is_los else NLOS_CURVE_SHARE) * scale_db
                 part = "los" if self.is_los else "nlos"
                 return compare_curves(found, family.curve, usual_db, part)
-            prior = SPREAD_DB.get(family.name, PAIR_SPREAD_DB)
-            prior = float(np.hypot(prior, (LOS_SHARE if self.is_los else NLOS_SHARE) * scale_db))
+            spread_db = SPREAD_DB.get(family.name, PAIR_SPREAD_DB)
+            share = LOS_SHARE if self.is_los else NLOS_SHARE
+            prior_sd = float(np.hypot(spread_db, share * scale_db))
         elif self.statistic == "blanks":
             found = means(values, groups, self.lasting.sd(in_class))
-            prior = LOS_BLANKS_SPREAD if self.is_los else NLOS_BLANKS_SPREAD
-            prior *= 1 if family.name in ENDS else 2
+            prior_sd = LOS_BLANKS_SPREAD if self.is_los else NLOS_BLANKS_SPREAD
+            prior_sd *= 1 if family.name in ENDS else 2
         else:
             magnitude = np.minimum(np.abs(in_class) / scale_db, MAX_SCALES)
             # An instrument's noise is independent from reading to reading.
             lasting_sd = None if self.statistic == "noise" else \
                 self.lasting.sd(magnitude / max(magnitude.mean(), TINY))
             found = log_scatters(values, groups, lasting_sd, scale_db)
-            prior = NOISE_SPREAD if self.statistic == "noise" else SCATTER_SPREAD
-            prior *= 1 if family.name in ENDS else 1.5
+            prior_sd = NOISE_SPREAD if self.statistic == "noise" else SCATTER_SPREAD
+            prior_sd *= 1 if family.name in ENDS else 1.5
         if np.isfinite(found.value).sum() < 2:
             return None
         if family.pairs:
             found = subtract_end_levels(found, family.pairs)
-        heavy = self.statistic == "level" and not self.is_los
-        return compare_with_peers(found, prior, NLOS_DOF if heavy else LOS_DOF)
+        heavy_tailed = self.statistic == "level" and not self.is_los
+        return compare_with_peers(found, prior_sd, NLOS_DOF if heavy_tailed else LOS_DOF)
 
 
 def _classes(readings: Readings, units: Units) -> dict[str, dict[str, _ValuesOfOneSight]]:
@@ -286,13 +287,13 @@ def log_odds_of_groups(readings: Readings, families: list[Family], units: Units)
     or fewer blanks than the peers' are no fault: log odds of -inf.
     """
     found, classes = [], _classes(readings, units)
-    alike = Counter((family.name, family.curve is None) for family in families)
+    family_count = Counter((family.name, family.curve is None) for family in families)
     for family in families:
         for statistic in family.statistics:
             is_base = family.name in BASE_ERRORS and statistic == "level"
-            of = "base" if is_base else "level" if statistic == "curve" else statistic
+            values_of = "base" if is_base else "level" if statistic == "curve" else statistic
             parts: dict[str, PeerComparison | Curves] = {}
-            for name, each in classes[of].items():
+            for name, each in classes[values_of].items():
                 part = each.compare(family)
                 if part is not None:
                     parts[name] = part
@@ -303,7 +304,7 @@ def log_odds_of_groups(readings: Readings, families: list[Family], units: Units)
             outlier = ANYWHERE.get(statistic, ANYWHERE_LOG)
             for name, part in parts.items():
                 odds = ODDS.get(family.name, FAMILY_ODDS)
-                odds /= alike[family.name, family.curve is None]
+                odds /= family_count[family.name, family.curve is None]
                 if len(parts) > 1:
                     both = PLACE_BOTH if family.name == "place" else BOTH_SHARE
                     odds *= both if name == "all" else (1 - both) / 2

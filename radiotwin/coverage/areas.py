@@ -56,8 +56,8 @@ class CoverageGrid:
              height_m: float) -> "CoverageGrid":
         """Fill an area (x_min, x_max, y_min, y_max) [m] with cells from its south-west corner.
 
-        Receivers are at `height_m` above the ground [m]. BadInput if no cell fits, or there are too
-        many.
+        Receivers are at `height_m` above the ground [m]. A rest in the north and east that
+        is narrower than a cell has none. BadInput if no cell fits, or there are too many.
         """
         x_min, x_max, y_min, y_max = bounds_m
         nx, ny = (np.floor((high - low) / step_m + 1e-9)
@@ -109,7 +109,7 @@ class CoverageGrid:
         return self.at_height(x, y, city)
 
     def at_height(self, x_m: np.ndarray, y_m: np.ndarray, city: CityMap) -> np.ndarray:
-        """Return positions (n, 3) [m] at the receivers' height above the ground of a map.
+        """Return positions (n, 3) [m] at the receivers' height above a map's ground, or the datum.
 
         See `with_ground_as_terrain`.
         """
@@ -175,7 +175,7 @@ def read_areas(path: Path | str, scene: Scene) -> list[Area]:
 
 
 def class_bounds(settings: CoverageSettings, bandwidth_hz: float) -> dict[str, tuple[float, ...]]:
-    """Return the lower ends of the classes of each raster, descending."""
+    """Return the lower ends of the classes of each raster, in its unit, descending."""
     top_bps = bandwidth_hz * settings.rate.max_bps_hz
     return {"received_power_dbm": settings.classes_dbm, "snr_db": SINR_CLASSES_DB,
             "sinr_db": SINR_CLASSES_DB, "rate_bps": tuple(top_bps * each for each in RATE_CLASSES),
@@ -250,12 +250,12 @@ def _covered_shares(power_dbm: np.ndarray, sd_db: np.ndarray | None, threshold_d
     """Compute which share of cells reaches a threshold [dBm].
 
     `share` counts cells whose median power does, `share_reliable` those whose location probability
-    is at least the reliability; `mean_probability` is the mean of that, where it is known.
+    is at least the reliability; `mean_probability` is its mean. Both leave out cells of unknown
+    standard deviation, and are missing if that leaves none.
     """
     found = {"threshold": threshold_dbm, "share": float((power_dbm >= threshold_dbm).mean())}
     if sd_db is None:
         return found
-    # No location probability without a standard deviation.
     known = np.isnan(power_dbm) | np.isfinite(sd_db)
     if known.any():
         power_dbm, sd_db = power_dbm[known], sd_db[known]

@@ -119,7 +119,7 @@ RASTERS = ("received_power_dbm", "received_power_sd_db", "best_server", "snr_db"
 
 
 def _write_geopackage(coverage: Coverage, scene: Scene, path: Path) -> None:
-    """Write a layer for each raster, of a multipolygon for each class, and one of transmitters."""
+    """Write a layer of a multipolygon per class for each drawn raster, and transmitters' points."""
     require_rasterio(path)
     from rasterio import features
 
@@ -146,12 +146,12 @@ def _write_geopackage(coverage: Coverage, scene: Scene, path: Path) -> None:
                    "minimum": lower, "area_m2": shapely.area(areas)}
         layers.append(Layer(file_stem(name), "MULTIPOLYGON", shapely.transform(areas, project),
                             columns))
-    placed = [each for each in coverage.transmitters if np.isfinite(each.position_m).all()]
+    located = [each for each in coverage.transmitters if np.isfinite(each.position_m).all()]
     power_dbm = {each["device"]: each["tx_power_dbm"] for each in coverage.summary["transmitters"]}
-    position_m = np.array([each.position_m for each in placed]).reshape(-1, 3)
-    columns = {"device": np.array([each.name for each in placed], object),
+    position_m = np.array([each.position_m for each in located]).reshape(-1, 3)
+    columns = {"device": np.array([each.name for each in located], object),
                "z_m": position_m[:, 2],
-               "tx_power_dbm": np.array([power_dbm[each.name] for each in placed], float)}
+               "tx_power_dbm": np.array([power_dbm[each.name] for each in located], float)}
     layers.append(Layer("transmitters", "POINT",
                         np.asarray(shapely.points(project(position_m[:, :2]))), columns))
     with atomic_file(path) as file:
@@ -225,7 +225,7 @@ def _write_geotiffs(coverage: Coverage, scene: Scene, folder: Path) -> None:
 
 
 def _write_kmz(coverage: Coverage, scene: Scene, path: Path) -> None:
-    """Write each raster as an overlay in the colours of its classes, for Google Earth."""
+    """Write each drawn raster as an overlay in the colours of its classes, for Google Earth."""
     legends = {name: legend_of(name, coverage) for name in drawn_rasters(coverage)}
 
     def draw(name: str, legend: Legend) -> bytes:
@@ -244,7 +244,7 @@ def _write_kmz(coverage: Coverage, scene: Scene, path: Path) -> None:
 
 
 def _legend_png(legends: list[Legend]) -> bytes:
-    """Draw all legends below each other; return the PNG."""
+    """Draw all legends below each other, of up to `LEGEND_ROWS` labels each; return the PNG."""
     rows = [min(len(each.labels), LEGEND_ROWS) + 1.6 for each in legends]
     figure = Figure(figsize=(2.3, 0.2 * sum(rows) + 0.1), facecolor="white")
     FigureCanvasAgg(figure)
@@ -264,7 +264,7 @@ def _legend_png(legends: list[Legend]) -> bytes:
 def available_formats(scene: Scene, wanted: list[str] | None) -> tuple[list[str], list[str]]:
     """Return the formats that can be written for a scene, and the reasons why others cannot.
 
-    BadInput if one of those `wanted` is unknown or cannot; None: all that can are.
+    `wanted` None stands for all formats. BadInput if a wanted one is unknown or cannot be written.
     """
     for name in wanted or ():
         if name not in FORMATS:

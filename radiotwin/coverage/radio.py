@@ -150,7 +150,8 @@ class ServerTally:
     """Best server and interference at n receivers, updated as transmitters are added.
 
     Every transmitter but the best server interferes, with its power times its load times the share
-    that falls into the server's channel.
+    that falls into the server's channel. The best server's `power_dbm`, `sd_db` and row `server`
+    (n,) are NaN, NaN and -1 where nothing is detected.
 
     Args:
         n: number of receivers.
@@ -170,20 +171,20 @@ class ServerTally:
             channel: int) -> None:
         """Add a transmitter: make it the best server where it is strongest, else interference.
 
-        Its power (n,) [dBm], NaN if not detected, has a standard deviation [dB].
+        Its received power is (n,) [dBm], NaN if not detected; `channel` is its row in `overlap`.
         """
-        heard = np.isfinite(power_dbm)
-        best = heard & ((self.server < 0) | (power_dbm > self.power_dbm))
-        beaten = np.flatnonzero(best & (self.server >= 0))
-        self._others_mw[self._channel[beaten], beaten] += (
-            self._load[beaten] * 10 ** (self.power_dbm[beaten] / 10))
-        weaker = heard & ~best
-        self._others_mw[channel, weaker] += load * 10 ** (power_dbm[weaker] / 10)
+        detected = np.isfinite(power_dbm)
+        best = detected & ((self.server < 0) | (power_dbm > self.power_dbm))
+        replaced = np.flatnonzero(best & (self.server >= 0))
+        self._others_mw[self._channel[replaced], replaced] += (
+            self._load[replaced] * 10 ** (self.power_dbm[replaced] / 10))
+        interfering = detected & ~best
+        self._others_mw[channel, interfering] += load * 10 ** (power_dbm[interfering] / 10)
         self.power_dbm[best] = power_dbm[best]
         self.sd_db[best] = np.broadcast_to(sd_db, best.shape)[best]
         self.server[best], self._load[best], self._channel[best] = row, load, channel
 
     def sinr_db(self, noise_dbm: float) -> np.ndarray:
-        """Return the SINR (n,) [dB] of the best server, for a noise power [dBm]."""
+        """Return the SINR (n,) [dB] of the best server (NaN: none), for a noise power [dBm]."""
         others_mw = np.einsum("nf,fn->n", self._overlap[self._channel], self._others_mw)
         return self.power_dbm - 10 * np.log10(10 ** (noise_dbm / 10) + others_mw)

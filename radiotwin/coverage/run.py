@@ -139,7 +139,7 @@ def predict_coverage(source: Twin | RadioMap | str, scene: Scene | Path | str,
 def _transmitters(source: Twin | RadioMap | str, scene: Scene,
                   given: Sequence[Transmitter] | None, devices: list[str] | None,
                   settings: CoverageSettings) -> list[Transmitter]:
-    """Return the transmitters to predict, each with position, power, load and frequency."""
+    """Return transmitters with load and frequency, and the position and power the source needs."""
     found = scene_transmitters(scene) if given is None else list(given)
     if isinstance(source, Twin):
         found = filled_in_from_twin(source, twin_transmitters(source, found) if given is None
@@ -181,9 +181,9 @@ def _transmitters(source: Twin | RadioMap | str, scene: Scene,
 
 
 def _moved_outdoors(transmitters: list[Transmitter], scene: Scene) -> list[Transmitter]:
-    """Move transmitters that are barely inside a building outside, with a warning.
+    """Move transmitters that are just inside a building or below ground outdoors, with a warning.
 
-    BadInput if one is deeper inside than a map is off, or below the ground.
+    BadInput if an error of the map does not explain it (`radiotwin.scene.footing`).
     """
     found = []
     for each in transmitters:
@@ -261,8 +261,9 @@ def _rasters(gains: GainSource, scene: Scene, transmitters: list[Transmitter], g
              bandwidth_hz: float) -> dict[str, np.ndarray]:
     """Predict power, best server, SNR, SINR, rate and probability; return rasters (ny, nx) by name.
 
-    Where nothing is received, best server is -1 and levels are NaN. A model without standard
-    deviations has no rasters of standard deviation and coverage probability.
+    Where nothing is detected, best server is -1, levels are NaN, and rate and probability 0; cells
+    left out indoors have NaN, and server -1. A model without standard deviations has no
+    rasters of standard deviation and coverage probability.
     """
     frequencies_hz = sorted({each.frequency_hz or 0.0 for each in transmitters})
     overlap = channel_overlap(np.array(frequencies_hz), bandwidth_hz, settings.aclr_db)
@@ -281,23 +282,23 @@ def _rasters(gains: GainSource, scene: Scene, transmitters: list[Transmitter], g
                                   np.ones(len(indoor), bool))
             index = used + rows.start * shape[1]
             tally = ServerTally(len(used), overlap)
-            entry_db = np.where(indoor[used], settings.indoor_loss_db or 0.0, 0.0)
+            entry_loss_db = np.where(indoor[used], settings.indoor_loss_db or 0.0, 0.0)
             for row, each in enumerate(transmitters):
                 mean_db, sd_db = gains.predict(row, receiver_m[used], index)
-                power_dbm = mean_db - entry_db
+                power_dbm = mean_db - entry_loss_db
                 if not gains.has_power:
                     power_dbm = power_dbm + each.fed_dbm
                 tally.add(row, power_dbm, np.nan if sd_db is None else sd_db, each.load or 0.0,
                           frequencies_hz.index(each.frequency_hz or 0.0))
                 advance(1)
             sinr_db = tally.sinr_db(noise_dbm)
-            found = {
+            predicted = {
                 "received_power_dbm": tally.power_dbm, "received_power_sd_db": tally.sd_db,
                 "best_server": tally.server, "snr_db": tally.power_dbm - noise_dbm,
                 "sinr_db": sinr_db, "rate_bps": rate_bps(sinr_db, bandwidth_hz, settings.rate),
                 "coverage_probability": location_probability(
                     tally.power_dbm, tally.sd_db, settings.threshold_dbm)}
-            for name, value in found.items():
+            for name, value in predicted.items():
                 values[name].reshape(-1)[index] = value
             values["indoor"][rows] = indoor.reshape(-1, shape[1])
     if not np.isfinite(values["received_power_sd_db"]).any():

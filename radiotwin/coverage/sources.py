@@ -28,7 +28,7 @@ from radiotwin.twin.model.model import FittedModel
 NOTED_TRANSMITTERS = 100  # per frequency: their links are checked against a law's validity range
 PATH_RECEIVERS = 5_000  # per batch of followed paths: bounds memory
 Levels = tuple[np.ndarray, np.ndarray | None]
-"""Mean levels (n,) [dB], NaN if not detected; standard deviations (n,) [dB], None if unknown."""
+"""(n,) mean gain [dB] or received power [dBm], NaN: not detected; (n,) sd [dB], None: unknown."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,9 +98,9 @@ def _source_of_law(kind: type[PublishedLaw], city: CityMap,
             rows = [row for row, each in enumerate(transmitters)
                     if each.frequency_hz == frequency_hz][:NOTED_TRANSMITTERS]
             device = np.repeat(rows, len(receiver_m))
-            some = link_geometry(device_m, np.tile(receiver_m, (len(rows), 1)), device, city,
-                                 float(frequency_hz or np.nan))
-            found += law.outside(some) if len(some) else []
+            sample = link_geometry(device_m, np.tile(receiver_m, (len(rows), 1)), device, city,
+                                   float(frequency_hz or np.nan))
+            found += law.outside(sample) if len(sample) else []
         return list(dict.fromkeys(found))
 
     return GainSource(f"{kind.name} ({kind.source})", predict, notes)
@@ -206,7 +206,7 @@ def source_of_twin(twin: Twin, scene: Scene, transmitters: Sequence[Transmitter]
 
 
 def _declared_antenna(twin: Twin, row: int) -> Antenna | None:
-    """Return the antenna that was declared for a device when the twin was fitted."""
+    """Return the antenna that was declared for a device when the twin was fitted; else None."""
     return twin.declared.radios[row].antenna if twin.declared.radios else None
 
 
@@ -214,19 +214,19 @@ def _notes_of_twin(twin: Twin, transmitters: Sequence[Transmitter], rows: list[i
                    has_power: bool) -> list[str]:
     """Return sentences on transmitters without measurements, and on antennas and powers not used.
 
-    `rows` are those of the transmitters in `twin.devices`, or their number for a new one.
+    `rows` are the transmitters' rows in `twin.devices`; a new one has `len(twin.devices)`.
     """
     device_count, notes = len(twin.devices), []
     new = [each for each, row in zip(transmitters, rows) if row == device_count]
-    through = [each.name for each in new if each.antenna is not None]
+    directed = [each.name for each in new if each.antenna is not None]
     undeclared = [each.device for row, each in enumerate(twin.devices)
                   if _declared_antenna(twin, row) is None]
     if new:
         notes.append(f"{len(new)} of {len(transmitters)} transmitters were not measured: "
                      "the twin's law for any device is used")
-    if through and len(undeclared) == device_count:
+    if directed and len(undeclared) == device_count:
         notes.append("the law of the twin's devices contains whatever antennas they have, and the "
-                     f"antenna of {some(through)} is added to it: unless they are isotropic it "
+                     f"antenna of {some(directed)} is added to it: unless they are isotropic it "
                      "counts twice; declare their antennas in devices.csv (antenna, azimuth_deg, "
                      "tilt_deg) and fit again")
     unused = [each.name for each, row in zip(transmitters, rows)
@@ -266,7 +266,7 @@ def source_of_map(radio_map: RadioMap, level: int,
 
 
 def twin_transmitters(twin: Twin, declared: Sequence[Transmitter]) -> list[Transmitter]:
-    """Return a twin's located devices as transmitters, with what `declared` has for their names."""
+    """Return a twin's located devices as transmitters, with the settings `declared` by name."""
     by_name = {each.name: each for each in declared}
     return [replace(by_name.get(each.device, Transmitter(each.device, np.empty(0))),
                     position_m=np.array(each.position_m, dtype=float))
@@ -282,7 +282,7 @@ def filled_in_from_twin(twin: Twin, transmitters: Sequence[Transmitter]) -> list
 
 
 def altitude_row(radio_map: RadioMap, height_m: float | None) -> int:
-    """Return the index of the altitude `height_m` [m] in a radio map; None: 0, the lowest."""
+    """Return a radio map's index of altitude `height_m` [m], BadInput if it lacks it; None: 0."""
     altitudes_m = radio_map.lattice.z_m
     if height_m is None:
         return 0

@@ -47,7 +47,7 @@ class Transmitter:
 
     @property
     def fed_dbm(self) -> float:
-        """Power at the antenna's port [dBm]: transmit power minus cable loss."""
+        """Power at the antenna's port [dBm]: transmit power minus cable loss; undeclared: 0."""
         return (self.tx_power_dbm or 0.0) - (self.cable_loss_db or 0.0)
 
 
@@ -108,7 +108,7 @@ def read_transmitters(path: Path | str, scene: Scene) -> list[Transmitter]:
 
 
 def select(transmitters: list[Transmitter], names: list[str] | None) -> list[Transmitter]:
-    """Return the transmitters of given names, in that order; all for None.
+    """Return the transmitters of given names, each once, in the order of the names; None: all.
 
     Raises:
         BadInput: there is no transmitter of a name.

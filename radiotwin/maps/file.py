@@ -173,14 +173,14 @@ def parts_of(shape: tuple[int, ...]) -> Iterator[tuple[slice, slice, slice]]:
     if levels * rows * columns <= BLOCK_VALUES:
         yield slice(0, levels), slice(0, rows), slice(0, columns)
         return
-    wide = min(columns, BLOCK_VALUES)
-    high = BLOCK_VALUES // wide if wide == columns else 1
-    high -= high % _CHUNK_CELLS if high > _CHUNK_CELLS else 0
+    part_columns = min(columns, BLOCK_VALUES)
+    part_rows = BLOCK_VALUES // part_columns if part_columns == columns else 1
+    part_rows -= part_rows % _CHUNK_CELLS if part_rows > _CHUNK_CELLS else 0
     for level in range(levels):
-        for row in range(0, rows, high):
-            for column in range(0, columns, wide):
-                yield (slice(level, level + 1), slice(row, min(row + high, rows)),
-                       slice(column, min(column + wide, columns)))
+        for row in range(0, rows, part_rows):
+            for column in range(0, columns, part_columns):
+                yield (slice(level, level + 1), slice(row, min(row + part_rows, rows)),
+                       slice(column, min(column + part_columns, columns)))
 
 
 def write_blocks(top: xr.Dataset, dtypes: dict[str, np.dtype], blocks: Iterable[MapBlock],
@@ -255,7 +255,7 @@ def without_cf(dataset: xr.Dataset) -> xr.Dataset:
 def form_problem(dataset: xr.Dataset) -> str | None:
     """Check variables, dims, dtypes and attributes; return the first fault, None for a radio map.
 
-    Reads no values.
+    Reads no values. BadInput if an axis is too long.
     """
     for name in VARIABLES:
         if name not in dataset.data_vars:

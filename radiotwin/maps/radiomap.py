@@ -152,9 +152,9 @@ class LatticeData(Summarised):
         add_colour_bar(ax, drawn, label, "both")
         if scene is not None:
             draw_outlines(ax, scene, frame)
-            at = [(each.x_m, each.y_m) for each in scene.config.devices if each.device == device]
-            if at:
-                draw_points(ax, frame, *np.array(at).T, marker="^", s=80, color="white",
+            xy_m = [(each.x_m, each.y_m) for each in scene.config.devices if each.device == device]
+            if xy_m:
+                draw_points(ax, frame, *np.array(xy_m).T, marker="^", s=80, color="white",
                             edgecolors="black", label=f"device {plain(device)}", zorder=4)
         frame.prepare(ax)
         add_legend(ax)
@@ -439,7 +439,7 @@ class RadioMap(LatticeData):
         return RadioMap(dataset)
 
     def selected(self, devices: list[str], lattice: Lattice) -> RadioMap:
-        """Return the map of the given devices on the given levels of its lattice."""
+        """Return the map of the given devices at a lattice's altitudes; all x and y are kept."""
         return RadioMap(self.dataset.sel(device=devices, z=lattice.z_m))
 
     def thinned(self, step: int) -> RadioMap:

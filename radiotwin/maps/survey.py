@@ -110,9 +110,9 @@ def segmented_truth(scene: Scene | Path | str) -> RadioMap:
         distance_m = np.sqrt(((receiver_m - device_m) ** 2).sum(axis=1))
         log_distance = np.log10(np.maximum(distance_m, 1.0))  # the law begins at 1 m
         mean_db = np.where(seen, LOS_LAW.mean_db(log_distance), NLOS_LAW.mean_db(log_distance))
-        for end, way_m in ((antenna, receiver_m - device_m),
+        for each, direction_m in ((antenna, receiver_m - device_m),
                            (scene.uav_antenna, device_m - receiver_m)):
-            mean_db = mean_db if end is None else mean_db + end.gain_dbi(way_m)
+            mean_db = mean_db if each is None else mean_db + each.gain_dbi(direction_m)
         gain_db.append(mean_db)
         sigma_db.append(np.where(seen, LOS_LAW.sd_db, NLOS_LAW.sd_db))
         los.append(seen)
@@ -163,9 +163,9 @@ def _require_possible(scene: Scene, truth: RadioMap) -> None:
     coherent = attributes.get("combining") == "coherent"
     bound_db = (20 if coherent else 10) * np.log10(_MAX_PATHS)
     positions_m, frequency_hz = scene.lattice.positions_m, scene.config.radio.frequency_hz
-    for device, at_m, antenna in zip(scene.config.devices, scene.device_m, scene.device_antennas):
+    for device, site_m, antenna in zip(scene.config.devices, scene.device_m, scene.device_antennas):
         row = truth.devices.index(device.device)
-        distance_m = np.maximum(np.linalg.norm(positions_m - at_m, axis=1), 0.01)
+        distance_m = np.maximum(np.linalg.norm(positions_m - site_m, axis=1), 0.01)
         above_db = (truth.gain_db[row].ravel() - sum(
             end.pattern.peak_dbi for end in (antenna, scene.uav_antenna) if end is not None)
             - 20 * np.log10(speed_of_light / (4 * np.pi * frequency_hz * distance_m)))
@@ -197,7 +197,10 @@ def random_waypoint(grid: FlightGrid, start: Cell, battery: float, rng: np.rando
 
 def lawnmower(grid: FlightGrid, start: Cell, battery: float, rng: np.random.Generator
               ) -> list[Cell]:
-    """Return the cells of a flight in parallel lanes, as close together as the battery allows."""
+    """Return the cells of a flight in parallel lanes, as close as the battery allows.
+
+    Ends of lanes from which the terminal cannot be reached are skipped.
+    """
     cells = [start]
     for corner in _lane_ends(grid.allowed.shape, battery, rng):
         if grid.steps_home(corner) == UNREACHABLE:
@@ -318,7 +321,7 @@ def declared_devices(scene: Scene) -> pd.DataFrame:
 def fly(scene: Scene, uav: UavConfig, pattern: str, rng: np.random.Generator) -> np.ndarray:
     """Simulate one flight of a UAV; return its cells (slots, 2) from start to terminal.
 
-    BadInput if the battery does not reach from the one to the other.
+    BadInput if the battery does not reach from start to terminal.
     """
     lattice = scene.lattice
     start, terminal = ((round((y_m - lattice.y_m[0]) / lattice.step_m),
@@ -335,14 +338,14 @@ def fly(scene: Scene, uav: UavConfig, pattern: str, rng: np.random.Generator) ->
 
 
 def _level(scene: Scene, uav: UavConfig) -> int:
-    """Return the index of a UAV's altitude."""
+    """Return the index of the lattice altitude nearest to a UAV's."""
     return int(np.abs(scene.lattice.z_m - uav.altitude_m).argmin())
 
 
 def heading_deg(cells: np.ndarray) -> np.ndarray:
     """Return the heading (slots,) [degrees clockwise from north] along cells (slots, 2).
 
-    It is that of the last move, before the first one that of the first, without any 0.
+    It is that of the last move; before the first move that of the first; 0 without any move.
     """
     moves = np.diff(cells, axis=0)
     heading = pd.Series(np.full(len(cells), np.nan))
@@ -355,8 +358,8 @@ def link_table(scene: Scene, flight: str, receiver: str, index: np.ndarray, leve
                time_s: np.ndarray, heading_deg: np.ndarray) -> pd.DataFrame:
     """Return the measurements of one receiver on one flight as rows of `Measurements.table`.
 
-    It was at the flat indices (slots,) of the lattice, and read levels (devices, slots) [dB]; NaN:
-    not detected.
+    The receiver was at the flat lattice indices (slots,), and read channel gains `level_db`
+    (devices, slots) [dB], NaN if not detected; they are rounded to 0.001 dB.
     """
     devices, slots = len(level_db), len(index)
     position_m = scene.lattice.positions_m[index]

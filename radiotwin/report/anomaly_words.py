@@ -119,8 +119,9 @@ def cause(name: str, members: Collection[str]) -> str:
 def group(anomaly: dict, origin: Origin | None = None) -> tuple[str, bool]:
     """Describe the links of an anomaly: "device d3 on flight f2"; also return if that is plural.
 
-    A device, receiver and flight with exactly the same links are joined by "or". A place is in
-    latitude and longitude if the origin of the local frame is known, else x and y [m].
+    `anomaly` is an entry of `anomalies` in `closeloop.json`. A device, receiver and flight with
+    exactly the same links are joined by "or". A place is in latitude and longitude if the origin of
+    the local frame is known, else x and y [m].
     """
     members = {end: names for end in ENDS if (names := anomaly["members"].get(end))}
     text = ""
@@ -212,7 +213,7 @@ def interval(found: dict) -> str:
 def _predicate(anomaly: dict, report: dict, is_plural: bool) -> str:
     """Say how a group deviates: "reads 5.6 dB (5.1 to 6.1) less than the seven others"."""
     found, peers = anomaly["size"], _peers(anomaly, report, is_plural)
-    value, end = found["value"] or 0.0, "" if is_plural else "s"
+    value, s = found["value"] or 0.0, "" if is_plural else "s"  # ending of the verb
     is_less = value < 0
     more = "less" if is_less else "more"
     # An amount is told without its sign, and so is its interval.
@@ -221,7 +222,7 @@ def _predicate(anomaly: dict, report: dict, is_plural: bool) -> str:
         low, high = -high, -low
     amount = abs(value)
     if anomaly["statistic"] == "scatter":
-        return f"scatter{end} {amount:.1f} times{_in_brackets(low, high)} as much as {peers}"
+        return f"scatter{s} {amount:.1f} times{_in_brackets(low, high)} as much as {peers}"
     if anomaly["statistic"] == "blanks":
         low, high = (None if each is None else 100 * each for each in (low, high))
         blank = "are" if is_plural else "is"
@@ -229,9 +230,9 @@ def _predicate(anomaly: dict, report: dict, is_plural: bool) -> str:
                 f"{'their' if is_plural else 'its'} links than {peers}")
     if anomaly["statistic"] == "curve":
         along = ALONG[anomaly["along"]]
-        return (f"change{end} by {amount:.1f} dB RMS{_in_brackets(low, high)} {along}, more than "
+        return (f"change{s} by {amount:.1f} dB RMS{_in_brackets(low, high)} {along}, more than "
                 f"{peers}")
-    return f"read{end} {amount:.1f} dB{_in_brackets(low, high)} {more} than {peers}"
+    return f"read{s} {amount:.1f} dB{_in_brackets(low, high)} {more} than {peers}"
 
 
 def _peers(anomaly: dict, report: dict, is_plural: bool) -> str:

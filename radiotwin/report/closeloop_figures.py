@@ -353,8 +353,7 @@ def waterfall_figure(report: dict) -> Figure:
 def dependence_figure(data: LoopData) -> Figure | None:
     """Draw the mean held-out residual over the continuous variables that it depends on most.
 
-    Returns:
-        the figure; None if the residual was tested against no such variable
+    None if there is no such variable. At most `MAX_PANELS` are drawn.
     """
     residual_db = [data.links.level_db - predicted for predicted in (data.before_db, data.after_db)]
     known = np.isfinite(residual_db[0]) & np.isfinite(residual_db[1])

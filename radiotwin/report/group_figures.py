@@ -74,11 +74,7 @@ def groups_figure(data: LoopData, report: dict) -> Figure:
     """Draw heat maps of the held-out residual by device and flight, and by receiver and flight.
 
     With a single flight there is one table, by device and receiver. Each has two panels: median and
-    scatter. Anomalies (deviating groups of links) are framed in the panel that shows them.
-
-    Args:
-        data: with the held-out prediction of the base.
-        report: content of `closeloop.json`, with the anomalies that are framed.
+    scatter. Anomalies of `report` (`closeloop.json`) are framed in the panel that shows them.
     """
     residual_db, anomalies = data.links.level_db - data.before_db, report.get("anomalies", [])
     flights, receivers = len(data.links.flight_names), len(data.links.receiver_names)

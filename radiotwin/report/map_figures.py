@@ -383,10 +383,8 @@ def _draw_label(ax: Axes, text: str, position_m: np.ndarray) -> None:
 def residual_map_figure(data: LoopData, background: MapBackground, report: dict) -> Figure:
     """Draw maps of the mean held-out residual in cells, before and after the effects.
 
-    Args:
-        data: links and predictions of a close-loop.
-        background: map under the residuals.
-        report: content of `closeloop.json`, whose anomalies and causes are marked.
+    Places, devices and causes are marked that `report` (`closeloop.json`) names. Both RMSEs are of
+    the links that the base predicts.
     """
     panels = [(f"before: {name_label(data.base)}", data.before_db)]
     if data.changed:
@@ -394,7 +392,7 @@ def residual_map_figure(data: LoopData, background: MapBackground, report: dict)
         added = join_names(names) if len(names) < 3 else f"{len(names)} effects"
         panels.append((f"after: with {added}", data.after_db))
     residuals_db = [data.links.level_db - predicted_db for _, predicted_db in panels]
-    has_before = np.isfinite(residuals_db[0])  # for both RMSEs: of the same links
+    has_before = np.isfinite(residuals_db[0])
     cells = [background.cell_means(residual_db) for residual_db in residuals_db]
     axes = background.panels(len(panels))
     range_db = residual_range_db(cells[0][2])
@@ -437,8 +435,7 @@ def _ring_devices(ax: Axes, links: DrawnLinks, report: dict) -> None:
 def level_map_figure(data: LoopData, background: MapBackground) -> Figure | None:
     """Draw maps of measured level, held-out prediction and their difference, averaged in cells.
 
-    Returns:
-        the figure; None where no detected link has a held-out prediction
+    None if no detected link has a held-out prediction.
     """
     links, predicted_db = data.links, data.after_db
     known = np.isfinite(links.level_db) & np.isfinite(predicted_db)
