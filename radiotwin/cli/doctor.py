@@ -117,7 +117,7 @@ def _check_gpu() -> Rows:
 
 
 def _check_packages(diagnosis: Diagnosis) -> Rows:
-    """List the declared packages with installed versions; add a problem for each missing one."""
+    """List packages with installed versions; add a problem for each missing one that is needed."""
     try:
         rows = [("radiotwin", version("radiotwin"))]
         requirements = requires("radiotwin") or []

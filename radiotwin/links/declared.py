@@ -173,9 +173,9 @@ class Declared:
         return replace(self, radios=tuple(updated))
 
     def of_devices(self, index: np.ndarray) -> Declared:
-        """Return a copy with the radios of other devices.
+        """Return a copy with the radios of other devices; `NOTHING` if the radios add nothing.
 
-        `index` (j,) tells the old device for each new one; -1: nothing is declared of it.
+        `index` (j,) is the old device of each new one; -1: nothing is declared of the new device.
         """
         if self.adds_nothing:
             return NOTHING

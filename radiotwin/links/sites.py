@@ -39,7 +39,7 @@ QUANTILE = 0.95  # upper end of a 90 % interval
 
 
 def site_of(links: Links, device: int) -> list[int]:
-    """Return the indices of a device and of the anchors within `SAME_SITE_M` of it, ascending."""
+    """Return a device and the anchors within `SAME_SITE_M` of it, ascending; empty if at NaN."""
     apart_m = np.linalg.norm(links.device_m - links.device_m[device], axis=1)
     return [int(other) for other in np.flatnonzero(apart_m <= SAME_SITE_M)
             if other == device or other in links.anchors]
@@ -60,10 +60,10 @@ def antenna_of(links: Links, device: int) -> list[int]:
 
 
 def relatives_of(links: Links, device: int, heard: set[int]) -> list[int]:
-    """Return up to `MAX_RELATIVES` detected devices with nearly the same paths as a given device.
+    """Return up to `MAX_RELATIVES` measured devices with nearly the same paths as a given device.
 
-    They are other devices of the same antenna, or if none was detected, of the same mast. `heard`
-    are the indices of detected devices.
+    They are other devices of the same antenna, or if none was measured, of the same mast. `heard`
+    are the indices of devices with links, detected or not.
     """
     others = ([other for other in group if other != device and other in heard]
               for group in (antenna_of(links, device), site_of(links, device)))

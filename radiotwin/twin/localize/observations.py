@@ -184,7 +184,7 @@ class DirectChannel:
 def tabulate(channel: Channel, receiver_m: np.ndarray, z_m: float,
              bounds: tuple[float, float, float, float], devices: np.ndarray,
              rng: np.random.Generator) -> LinkTable | DirectChannel:
-    """Tabulate a channel if a table reproduces its predictions at random links, else return it.
+    """Tabulate a channel if a table reproduces its predictions at random links, else only wrap it.
 
     They must agree to MEAN_TOLERANCE_DB and SD_TOLERANCE for all `devices` (k,), which are at the
     height `z_m` within the bounds [m].

@@ -38,12 +38,12 @@ MAX_SD_RATIO = 100.0  # largest in a file
 
 
 def far_share(away_m: np.ndarray, half_m: float) -> np.ndarray:
-    """Return how much far weights count (n,), by the distance to the nearest measurement [m]."""
+    """Return the share (n,) of far weights, 0 to 1, by distance to the nearest measurement [m]."""
     return 1 - half_m / (away_m + half_m)
 
 
 def sd_factor(share: np.ndarray, sd_ratio: tuple[float, float]) -> np.ndarray:
-    """Return the factor (n,) on error scales, between that near and that far from measurements."""
+    """Return the factor (n,) on error scales, from the ratios near and far from measurements."""
     near, far = np.square(sd_ratio)
     return np.sqrt((1 - share) * near + share * far)
 
@@ -102,7 +102,7 @@ class Blend:
                     shadowing: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Return level (n, k) and error scale (n, k) [dB] of each model, in the order of `weights`.
 
-        Those of channel and named effects are given (n,), and the shadowing as of
+        `mean_db` and `scale_db` (n,) are of channel and named effects, `shadowing` as of
         `CorrelatedShadowing.at`.
         """
         levels = {NAMED: mean_db, SHADOWED: mean_db + shadowing[0] * scale_db}

@@ -87,10 +87,10 @@ class Relatives:
 
         The correlation is that of `field`; None: it is fitted. Residuals are in error scales.
         """
-        heard = set(np.unique(links.device).tolist())
+        measured = set(np.unique(links.device).tolist())
         devices = [(device, np.flatnonzero(np.isin(links.device, relatives)))
                    for device in sorted(links.anchors)
-                   for relatives in [relatives_of(links, device, heard)] if relatives]
+                   for relatives in [relatives_of(links, device, measured)] if relatives]
         rows = np.concatenate([np.zeros(0, dtype=int), *(rows for _, rows in devices)])
         if len(rows) < MIN_POINTS:
             return None
@@ -104,7 +104,7 @@ class Relatives:
             field = field.with_points(*points, kind)
         mean = relative_sd * field.mean(links.device, links.receiver_m, links.receiver)
         near = [device for device in field.fields
-                if set(antenna_of(links, device)) & (heard - {device})]
+                if set(antenna_of(links, device)) & (measured - {device})]
         passed_on: dict[int, float] = {}
         for group in (near, sorted(set(field.fields) - set(near))):
             group_links = np.isin(links.device, group)

@@ -178,7 +178,7 @@ class Model:
 
     @cached_property
     def losses(self) -> Losses:
-        """Return how likely effects blank or lower each reading, and by how much they lower it."""
+        """Return how likely effects blank or lower each reading, and by how much (one of them)."""
         losses = [effect.losses(self.links) for effect in self.effects
                   if isinstance(effect, DetectionEffect)]
         if not losses:
@@ -358,7 +358,7 @@ class Unheard:
 
     @classmethod
     def of(cls, fit: Fit, device_sd_db: float) -> Unheard | None:
-        """Estimate mean and spread of trained devices' offsets; None: no other device, or none."""
+        """Estimate mean and spread of trained devices' offsets; None: all are trained, or none."""
         links, device_db, declared = fit.links, np.zeros(len(fit.links)), set[int]()
         for number, (effect, term) in enumerate(zip(fit.effects, fit.model.terms, strict=True)):
             if effect.is_declared:
