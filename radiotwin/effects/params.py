@@ -192,7 +192,7 @@ class Estimate:
         return self.sd_of(np.eye(len(self.coefficients)))
 
     def sd_of(self, shares: np.ndarray) -> np.ndarray:
-        """Compute the largest standard deviation (m,) of linear combinations (m, q)."""
+        """Compute the sd (m,) of linear combinations (m, q), the largest over the clusterings."""
         variance = np.max([np.einsum("ij,jk,ik->i", shares, covariance, shares)
                            for covariance in self.covariances], axis=0)
         return np.sqrt(np.maximum(variance, 0.0))

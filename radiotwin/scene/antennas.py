@@ -79,7 +79,7 @@ class Pattern:
 
 
 def _bracket(grid: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the index of the grid value below each value, and the value's fraction of that step.
+    """Return the index (…,) of the grid value below each value, and its fraction (…,) of the step.
 
     Values beyond the grid are clipped to its ends.
     """

@@ -133,7 +133,7 @@ class Scene(Summarised):
         """Return the heights of the 3D map over the extent as a raster.
 
         Args:
-            step_m: Width of a cell [m].
+            step_m: Width of a cell, above 0 [m].
 
         Returns:
             Variable `height_m` (y, x): height of the highest surface above z = 0 [m].
@@ -159,7 +159,7 @@ class Scene(Summarised):
 
         Args:
             layer: `buildings` (columns `building`, `material`, `height_m`: largest height above
-                the ground below, and the outline) or `devices`.
+                the ground below, and the outline; without the ground) or `devices`.
 
         Raises:
             BadInput: GeoPandas is not installed, or another layer.

@@ -284,7 +284,7 @@ def _shape(drift: Drift, links: Links, time_s: np.ndarray,
 
 
 def _gap_s(links: Links, rows: np.ndarray, when_s: float) -> tuple[float, float]:
-    """Return the times of the last reading before a step and of the first one after it [s]."""
+    """Return the times [s] of the last reading before a step and the first after; else `when_s`."""
     time_s = links.time_s[rows & np.isfinite(links.time_s) & np.isfinite(links.level_db)]
     before, after = time_s[time_s < when_s], time_s[time_s >= when_s]
     return (float(before.max()) if len(before) else when_s,

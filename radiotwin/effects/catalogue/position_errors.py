@@ -84,7 +84,7 @@ class _MovedDevices(_PositionError):
         return links.with_devices(device_m)
 
     def positions(self, links: Links, estimate: Estimate, when: str = "") -> dict[str, Parameter]:
-        """Report x and y of each moved device [m]; `when` follows the device's name."""
+        """Report x and y of moved devices, all as `params.device` [m]; `when` follows names."""
         given_m = links.device_m[self.params.device, :2]
         return {f"{axis}_m[{links.device_names[device]}{when}]": Parameter.normal(
                     old_m + move_m, sd, "m", Allowed(old_m - MAX_MOVE_M, old_m + MAX_MOVE_M))

@@ -81,7 +81,7 @@ def make_blocks(prisms: Sequence[Prism], contacts: Contacts) -> list[Block]:
 
 
 def split_roof(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, trimesh.Trimesh | None]:
-    """Split a mesh into walls with bottom, and roofs: faces that slope by less than 78 degrees.
+    """Split a mesh into walls with bottom, and roofs: upward faces of slopes below 78 degrees.
 
     The roofs are None if no face, or every face, is one.
     """

@@ -132,7 +132,7 @@ def left_out_problems(left_out: Sequence[LeftOut],
                       bbox_deg: tuple[float, float, float, float] | None) -> list[Problem]:
     """Return a warning for each reason why features of a map were left out.
 
-    Only features that reach into the box (south, west, north, east) [degrees] count; None: all do.
+    Only features known to reach into the box (south, west, north, east) [degrees] count; None: all.
     """
     by_reason: dict[str, list[str]] = {}
     for one in left_out:

@@ -175,7 +175,7 @@ def _worst_nodes(triangle: np.ndarray, error_m: np.ndarray, tolerance_m: float) 
 def read_heights(path: Path, origin: Origin, box_m: Bounds, unit: str | None = None) -> HeightGrid:
     """Read the terrain heights of an area from a GeoTIFF, averaged or interpolated to a grid.
 
-    Nodes without data get the height of the nearest pixel with data.
+    Nodes without data, or beyond `HEIGHTS_M`, get the height of the nearest pixel with data.
 
     Args:
         path: GeoTIFF.

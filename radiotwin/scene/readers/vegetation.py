@@ -44,8 +44,8 @@ def make_vegetation(features: Sequence[Feature], origin: Origin,
                     ) -> tuple[list[VegetationConfig], list[Problem]]:
     """Make vegetation from areas and lines, cut to a box (x_min, x_max, y_min, y_max) [m].
 
-    Each remaining polygon is one entry; several may share a name. Also returns a warning if some
-    were left out.
+    Each polygon of `MIN_AREA_M2` or more is one entry; several may share a name. Also returns a
+    warning if the smallest were left out, as a scene has a limit of corners.
     """
     x_min, x_max, y_min, y_max = box_m
     box = shapely.box(x_min, y_min, x_max, y_max)
