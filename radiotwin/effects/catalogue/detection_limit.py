@@ -50,11 +50,11 @@ class DetectionLimit(LimitEffect):
         detected = np.isfinite(links.level_db)
         for receiver in np.unique(links.receiver):
             rows = links.receiver == receiver
-            usual_db = float(np.median(links.limit_db[rows]))
+            declared_db = float(np.median(links.limit_db[rows]))
             limit = receiver_limit(links.level_db[rows], view.mean_db[rows], view.scale_db[rows],
-                                   view.design_effect, usual_db)
-            if (limit is not None and limit.is_sure and limit.limit_db > usual_db + MIN_RISE_DB
-                    and (np.isinf(usual_db) or limit.over_declared_nats > MIN_NATS)
+                                   view.design_effect, declared_db)
+            if (limit is not None and limit.is_sure and limit.limit_db > declared_db + MIN_RISE_DB
+                    and (np.isinf(declared_db) or limit.over_declared_nats > MIN_NATS)
                     and not contradict_limit(links.level_db[rows & detected], limit.limit_db)):
                 found[int(receiver)], sd_db[int(receiver)] = limit.limit_db, limit.sd_db
         return [self.Params(receivers=found, sd_db=sd_db)] if found else []

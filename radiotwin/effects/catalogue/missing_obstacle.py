@@ -354,7 +354,7 @@ def built_share(links: Links, box: Box, found: Iterable[Box] = ()) -> float:
 
 @lru_cache(maxsize=32)
 def _with_box(city: CityMap, box: Box) -> CityMap:
-    """Add a box of concrete to a map."""
+    """Add a concrete box to a map; its height counts from the ground below its centre."""
     import trimesh  # slow to load, and needed for exact levels only
 
     pose = trimesh.transformations.rotation_matrix(np.radians(box.turn_deg), (0, 0, 1))
