@@ -367,9 +367,9 @@ class CrossFit:
         """
         found = np.zeros(len(self.index), dtype=bool)
         for number, fold in enumerate(self.folds):
-            for effect, term, place in zip(self.whole.effects, self.whole.model.terms,
+            for effect, term, match in zip(self.whole.effects, self.whole.model.terms,
                                            match_effects(self.whole, fold), strict=True):
-                if effect.within_flights and place is None:
+                if effect.within_flights and match is None:
                     found |= (self.index == number) & term.acts
         return found
 

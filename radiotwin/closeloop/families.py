@@ -368,7 +368,7 @@ def _curves(readings: Readings, units: Units) -> Iterator[Family]:
 
 
 def _window_of_reading(readings: Readings, label: np.ndarray, count: int) -> np.ndarray:
-    """Return windows (n,): each label's time cut into 2 to `MAX_WINDOWS` of `count` readings."""
+    """Return each reading's window (n,) in its label's time: 2 to `MAX_WINDOWS` of `count`."""
     number = np.clip(np.bincount(label) // count, 2, MAX_WINDOWS)
     return np.floor(_share_of_time(readings, label) * number[label]).astype(np.int64)
 
@@ -382,18 +382,18 @@ def _quantiles(values: np.ndarray, count: int) -> np.ndarray:
 
 def _places(readings: Readings, units: Units) -> Iterator[Family]:
     """Yield ground squares that hold the moving end of links, or that links cross below `LOW_M`."""
-    share = (np.arange(RAY_SAMPLES) + 0.5) / RAY_SAMPLES
-    along_m = readings.device_m[:, None] + share[:, None] * (
+    fraction = (np.arange(RAY_SAMPLES) + 0.5) / RAY_SAMPLES
+    along_m = readings.device_m[:, None] + fraction[:, None] * (
         readings.receiver_m - readings.device_m)[:, None]
     low = along_m[..., 2] < LOW_M
     link = np.broadcast_to(np.arange(len(readings))[:, None], low.shape)[low]
     ends = readings.device, readings.track
     for width_m in GRID_M:
-        end = _squares_of(readings.moving_m, width_m)
-        yield _square_family(np.arange(len(readings)), end, width_m, ends, units)
-        cell = _squares_of(along_m[low], width_m)
-        if len(cell):
-            yield _square_family(link, cell, width_m, ends, units)
+        square = _squares_of(readings.moving_m, width_m)
+        yield _square_family(np.arange(len(readings)), square, width_m, ends, units)
+        crossed = _squares_of(along_m[low], width_m)
+        if len(crossed):
+            yield _square_family(link, crossed, width_m, ends, units)
 
 
 def _square_family(link: np.ndarray, cell: np.ndarray, width_m: float,

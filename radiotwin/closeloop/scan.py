@@ -105,6 +105,7 @@ class Compared:
     """Log odds (k,) [nats] that k groups (or curves) of a family stand out by one statistic.
 
     They are of links of one `sight`: `los`, `nlos` or `all`; NaN or -inf if a group is not judged.
+    `distance` has the deviations from the peers: dB, share of blanks, or log of the scatter ratio.
     """
 
     family: Family
@@ -316,7 +317,7 @@ def log_odds_of_groups(readings: Readings, families: list[Family], units: Units)
 
 
 def _together(parts: list[PeerComparison | Curves]) -> PeerComparison | Curves:
-    """Combine the distances from peers in LoS and NLoS links, weighted by precision."""
+    """Combine the deviations from peers in LoS and in NLoS links, weighted by precision."""
     of_groups = [each for each in parts if isinstance(each, PeerComparison)]
     of_curves = [each for each in parts if isinstance(each, Curves)]
     return combine_parts(of_groups) if of_groups else combine_curves(of_curves)

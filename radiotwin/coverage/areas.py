@@ -219,13 +219,13 @@ def cells_in(outline: BaseGeometry, grid: CoverageGrid) -> np.ndarray:
     return found
 
 
-def _area_record(name: str, dataset: xr.Dataset, where: np.ndarray, grid: CoverageGrid,
+def _area_record(name: str, dataset: xr.Dataset, mask: np.ndarray, grid: CoverageGrid,
                  transmitters: Sequence[Transmitter], settings: CoverageSettings,
                  classes: dict[str, tuple[float, ...]]) -> dict[str, Any]:
     """Compute the shares of one area, given its mask of cells (ny, nx); see `area_records`."""
-    cell_m2, n = grid.step_m**2, int(where.sum())
-    power_dbm = dataset["received_power_dbm"].values[where]
-    sd_db = (dataset["received_power_sd_db"].values[where].astype(float)
+    cell_m2, n = grid.step_m**2, int(mask.sum())
+    power_dbm = dataset["received_power_dbm"].values[mask]
+    sd_db = (dataset["received_power_sd_db"].values[mask].astype(float)
              if "received_power_sd_db" in dataset else None)
     thresholds = sorted({*settings.classes_dbm, settings.threshold_dbm}, reverse=True)
     record: dict[str, Any] = {
@@ -233,11 +233,11 @@ def _area_record(name: str, dataset: xr.Dataset, where: np.ndarray, grid: Covera
         "received_power_dbm": [_covered_shares(power_dbm, sd_db, level_dbm, settings.reliability)
                                for level_dbm in thresholds]}
     for key in ("snr_db", "sinr_db", "rate_bps"):
-        values = dataset[key].values[where]
+        values = dataset[key].values[mask]
         record[key] = [{"threshold": level, "share": float((values >= level).mean())}
                        for level in classes[key]]
-    record["mean_rate_bps"] = float(dataset["rate_bps"].values[where].mean(dtype=float))
-    servers = np.bincount(dataset["best_server"].values[where] + 1,
+    record["mean_rate_bps"] = float(dataset["rate_bps"].values[mask].mean(dtype=float))
+    servers = np.bincount(dataset["best_server"].values[mask] + 1,
                           minlength=len(transmitters) + 1)
     record["best_server"] = {each.name: float(count / n)
                              for each, count in zip(transmitters, servers[1:])}

@@ -266,7 +266,7 @@ def source_of_map(radio_map: RadioMap, level: int,
 
 
 def twin_transmitters(twin: Twin, declared: Sequence[Transmitter]) -> list[Transmitter]:
-    """Return a twin's located devices as transmitters, with the settings `declared` by name."""
+    """Return a twin's located devices as transmitters, with settings from `declared` by name."""
     by_name = {each.name: each for each in declared}
     return [replace(by_name.get(each.device, Transmitter(each.device, np.empty(0))),
                     position_m=np.array(each.position_m, dtype=float))

@@ -149,9 +149,9 @@ def histogram_figure(effect: EffectData, _: MapBackground) -> Figure:
 
 
 def interval_figure(effect: EffectData, background: MapBackground) -> Figure:
-    """Draw an effect's `MAX_BARS` largest parameters of devices or receivers with 90 % intervals.
+    """Draw an effect's parameter for each device or receiver as a bar with its 90 % interval.
 
-    Parameters that the data do not determine are left out; if all are, `variable_figure` is drawn.
+    The `MAX_BARS` largest that the data determine are drawn; `variable_figure` if there are none.
     """
     known = {name: each for name, each in effect.parameters.items() if each.determined}
     if not known:
@@ -312,17 +312,17 @@ def waterfall_figure(report: dict) -> Figure:
             if candidate["kept"] and candidate["heldout_rmse_db"] is not None]
     declared = sum(effect.get("is_declared", False) for effect in report["effects"])
     kept = kept[declared:]  # declared effects come first: they are part of the base
-    levels = [before, *(rmse_db for _, rmse_db in kept)]
+    rmses = [before, *(rmse_db for _, rmse_db in kept)]
     without_cause = interpolations()
     steps = [(name_label(name), name in without_cause) for name, _ in kept]
-    if kept and abs(levels[-1] - after) > MIN_STEP_DB:
-        levels.append(after)
+    if kept and abs(rmses[-1] - after) > MIN_STEP_DB:
+        rmses.append(after)
         known = error.get("after_with_quality")
         steps.append(("on a map: quality not known" if known else "joint refit", False))
     figure = new_figure(max(1.15 * (len(steps) + 2) + 2.6, 6.5), 4.6)
     ax = figure.add_subplot()
     _draw_bar(ax, 0, 0.0, before, BEFORE, f"{before:.2f} dB")
-    for position, ((_, interpolated), high, low) in enumerate(zip(steps, levels, levels[1:]), 1):
+    for position, ((_, interpolated), high, low) in enumerate(zip(steps, rmses, rmses[1:]), 1):
         colour = "0.5" if interpolated else AFTER if low <= high else BEFORE
         change = f"{low - high:+.2f}".replace("-", "−")
         _draw_bar(ax, position, high, low, colour, change, alpha=0.55)
@@ -333,12 +333,12 @@ def waterfall_figure(report: dict) -> Figure:
         _connect(ax, len(names), after)
         _draw_bar(ax, len(names), 0.0, after, AFTER, f"{after:.2f} dB")
         names.append("after")
-    highest = MAX_LINE * max(before, after, *levels)  # or the bars would be too low to be read
+    highest = MAX_LINE * max(before, after, *rmses)  # or the bars would be too low to be read
     lines = [(value["rmse_db"], name_label(name), "--") for name, value in
              report["baselines"].items() if (value["rmse_db"] or np.inf) <= highest]
     if error["noise_floor_db"] is not None:
         lines.append((error["noise_floor_db"], "noise of one\nmeasurement", ":"))
-    top = 1.12 * max(before, after, *levels, *(value for value, *_ in lines))
+    top = 1.12 * max(before, after, *rmses, *(value for value, *_ in lines))
     ax.set(xlim=(-0.6, len(names) - 0.4), ylim=(0, max(top, 0.1)),
            ylabel="RMSE on held-out links [dB]",
            title=_change(before, after) if kept else "no effect of the catalogue lowers the error")

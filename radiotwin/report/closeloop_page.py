@@ -58,12 +58,7 @@ def write_closeloop_page(report: dict, folder: Path | str, title: str) -> None:
 def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
     """Collect the template variables of a close-loop's part of a page (`closeloop_*.html`).
 
-    Args:
-        report: content of `closeloop.json`, checked.
-        folder: of the figures.
-
-    Raises:
-        BadInput: a damaged figure.
+    `report` is a checked `closeloop.json`; `folder` has its figures. BadInput if one is damaged.
     """
     candidates, (lead, *more) = report["candidates"], words.summary(report)
     map_picture, steps, *pictures = _pictures(report, folder)

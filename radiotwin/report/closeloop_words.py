@@ -88,7 +88,7 @@ def objects(report: dict) -> list[str]:
 
 
 def _object_words(effect: dict, origin: Origin | None) -> str:
-    """Describe a cause: devices or receivers, size, antenna direction, place; if determined."""
+    """Describe a cause: devices or receivers, determined size and direction, and single place."""
     forms = effects_named(effect["name"])
     form = next((each for each in forms if each.variant == effect.get("variant")), None)
     words = form and form.in_words or name_label(effect["name"])

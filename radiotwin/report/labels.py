@@ -127,7 +127,7 @@ def join_names(names: list[str]) -> str:
 
 
 def number(value: float | None) -> str:
-    """Format a number: two decimals, from 1000 none, below 0.1 two digits; None as a dash."""
+    """Format a number: two decimals; int or from 1000: none; below 0.1: two digits; None: dash."""
     if value is None:
         return "–"
     if isinstance(value, int):
