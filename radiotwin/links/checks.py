@@ -137,7 +137,7 @@ def check_names(measurements: Measurements) -> list[str]:
 
 def check_positions(receiver_m: np.ndarray, device_m: np.ndarray,
                     scene: Scene | None) -> list[str]:
-    """Note positions all within `CLOSE_M`, in another unit or frame; with a scene `receiver_notes`.
+    """Note positions that all lie within `CLOSE_M` (wrong unit), and with a scene `receiver_notes`.
 
     Receivers are (n, 3), devices (k, 3) [m], compared in x and y; fewer than `MIN_POSITIONS` pass.
     BadInput if all of both lie within `CLOSE_M`, or most receivers are outside the map.
@@ -235,7 +235,7 @@ def move_anchors_out(links: Links, scene: Scene, refuse: bool = True) -> Links:
     """Move anchors (devices of declared position) out of buildings and above the map's ground.
 
     An anchor is moved only by as much as a map may be wrong (`radiotwin.scene.footing`), with a
-    note. BadInput if one is far from the receivers, or too deep inside (not `refuse`: it stays).
+    note. BadInput if one is far from the receivers, or too deep (without `refuse`, it stays there).
     """
     anchors = np.array(sorted(links.anchors), dtype=int)
     anchors = anchors[np.isfinite(links.device_m[anchors]).all(axis=1)]
@@ -314,7 +314,7 @@ def find_fill_value(level_db: np.ndarray) -> tuple[float | None, float]:
     """Find the level that receivers write for "not detected"; return it and its share of readings.
 
     It is the lowest of `level_db` (n,), if far more frequent than the next ones, or three times and
-    far below (by 3 dB and ten usual steps). (None, 0) without one, or of less than `MIN_LINKS`.
+    far below (by 3 dB and ten usual steps). (None, 0): none, or fewer than `MIN_LINKS` readings.
     """
     read_db = level_db[np.isfinite(level_db)]
     if len(read_db) < MIN_LINKS:

@@ -236,7 +236,7 @@ def _distance_m(position_m: np.ndarray, first: np.ndarray, second: np.ndarray) -
 
 
 def devices_move(links: Links) -> bool:
-    """Return whether devices are places of a moving one: below `MIN_SERIES` links in a series."""
+    """Return whether devices are places of one moving device, with few links each per flight."""
     series = pd.DataFrame({"device": links.device, "receiver": links.receiver,
                            "flight": links.flight})
     return len(series.drop_duplicates()) > len(links) / MIN_SERIES
@@ -293,7 +293,7 @@ def correlation_length_m(links: Links, z: np.ndarray) -> float:
 
 @lru_cache(maxsize=REMEMBERED)
 def _variogram(links: Links, seen: bytes) -> tuple[float, np.ndarray, Variogram | None]:
-    """Return shortest length [m], detected rows (m,) in the variogram's order, variogram or None.
+    """Return shortest length [m], rows (m,) in the order of the variogram, and variogram or None.
 
     `seen` is the mask of detected links as bytes: the key of a cache, as this takes long.
     """

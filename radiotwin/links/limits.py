@@ -187,7 +187,7 @@ def estimate_limits(links: Links, declared_db: float | None) -> tuple[np.ndarray
     """Estimate the weakest level that each receiver detects, and test the limit that is declared.
 
     The present limits are ignored. Returned are the limit (n,) of each link, as levels, and notes.
-    It is -inf if a receiver has no blanks and no declared limit, or blanks at any level.
+    The limit is -inf of a receiver without blanks and declared limit, or with blanks at any level.
     """
     declared = -np.inf if declared_db is None else declared_db
     ignored = _reason_to_ignore(links, declared)
@@ -366,7 +366,7 @@ def _limit_text(name: str, limit_db: float, found: LimitEstimate | None, unit: s
 
 
 def with_usual_limits(links: Links) -> Links:
-    """Lower limits far above the usual limit of detection to it, and set unknown ones to it.
+    """Set limits that are unknown, or far above the usual limit of detection, to the usual one.
 
     Blanks that are predicted above it then need another explanation. If no limit is known and there
     are blanks, the lowest reading is taken for the limit of all.

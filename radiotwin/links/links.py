@@ -476,7 +476,7 @@ class Links:
 
     @cached_property
     def receiver_axes(self) -> np.ndarray:
-        """(n, 3, 3) right, nose, top in (east, north, up); NaN: no heading; unknown tilts are 0."""
+        """(n, 3, 3) receiver's right, nose, top [east, north, up]; NaN: no heading; no tilt: 0."""
         heading, pitch, roll = (
             np.radians(np.zeros(len(self)) if angle is None else angle) for angle in
             (self.heading_deg, *(angle if angle is None else np.nan_to_num(angle)

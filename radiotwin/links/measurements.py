@@ -228,9 +228,9 @@ class Measurements(Summarised):
         return read_measurements(path, devices_path)
 
     def save(self, path: Path | str) -> None:
-        """Write the links to a path, and the devices to `devices.csv` in the same folder.
+        """Write the links to a path, and `devices.csv` and antenna files to the same folder.
 
-        The path ends in `.csv`, `.csv.gz` or `.parquet`. Origin (`frame.toml`) and antennas follow.
+        The path ends in `.csv`, `.csv.gz` or `.parquet`. A known origin goes to `frame.toml` there.
 
         Raises:
             BadInput: `path` cannot be written, or the folder has a `devices.csv` of other devices,

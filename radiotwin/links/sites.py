@@ -146,10 +146,9 @@ def inseparable_pairs(one: np.ndarray, other: np.ndarray) -> dict[int, int]:
 
 
 def inseparable_end(links: Links, end: str, members: set[int]) -> str | None:
-    """Return the opposite end if a device and a receiver have exactly the same detected links.
+    """Return the opposite end if one there has exactly the detected links of a member, or None.
 
-    Their errors are then indistinguishable. `end` is device or receiver, `members` are indices
-    there. None: all are distinguishable.
+    Their errors are then inseparable. `members` are indices at `end`, device or receiver.
     """
     other, detected = OTHER_END[end], np.isfinite(links.level_db)
     together = inseparable_pairs(getattr(links, end)[detected], getattr(links, other)[detected])

@@ -301,7 +301,7 @@ def _los(scene: Scene, true_m: dict, links: Measurements) -> np.ndarray:
 
 def _scores(model: str, against: str, positions: str, measured_db: np.ndarray,
             predicted_db: np.ndarray, los: np.ndarray) -> list[dict]:
-    """Return errors [dB] of detected, predicted links: all, LoS (`los` 1), NLoS (0); NaN: none."""
+    """Return errors [dB] of detected and predicted links: all, LoS (1), NLoS (0); NaN: no link."""
     rows = []
     usable = np.isfinite(measured_db) & np.isfinite(predicted_db)
     for links, mask in zip(CLASSES, (usable, usable & (los == 1), usable & (los == 0))):
@@ -317,7 +317,7 @@ def _scores(model: str, against: str, positions: str, measured_db: np.ndarray,
 
 
 def _location_rows(model: str, twin: Twin, true_m: dict) -> list[dict]:
-    """Return a row with horizontal error (NaN: no true position) of each unknown device [m]."""
+    """Return rows of unknown devices: horizontal error (NaN: no true position), 90 % radius [m]."""
     rows = []
     for device in twin.devices:
         if device.role == "unknown":

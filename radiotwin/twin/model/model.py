@@ -178,7 +178,7 @@ class Model:
 
     @cached_property
     def losses(self) -> Losses:
-        """Return how likely effects blank or lower each reading, and by how much (one of them)."""
+        """Return how likely effects blank or lower each reading; only the strongest lowers it."""
         losses = [effect.losses(self.links) for effect in self.effects
                   if isinstance(effect, DetectionEffect)]
         if not losses:

@@ -44,7 +44,7 @@ class ReadingDerivative:
     sides: tuple[float, float] = (1.0, 1.0)
 
     def moved(self, known: np.ndarray, wanted: np.ndarray) -> ReadingDerivative:
-        """Return the derivative on links of mask `wanted` (n,), from mask `known` (n,); else 0."""
+        """Return the derivative on links `wanted` (n,) bool; 0 outside links `known` (n,) bool."""
         def on_wanted(values: np.ndarray) -> np.ndarray:
             on_all = np.zeros(len(known))
             on_all[known] = values
