@@ -141,8 +141,8 @@ class Family:
 def units_of(readings: Readings) -> Units:
     """Label readings that share errors, by squares of ground around the moving end.
 
-    Readings of one flight in a square of `PASSING_M` share passing errors. Readings of one device
-    in a square of `LASTING_M` share errors of the map, which last over all flights.
+    Readings of one flight in a square of `PASSING_M` share errors of that moment. Readings of one
+    device in a square of `LASTING_M` share errors of the map, on all flights.
     """
     passing, lasting = (_squares_of(readings.moving_m, width_m)
                         for width_m in (PASSING_M, LASTING_M))

@@ -140,8 +140,8 @@ class _Found:
 def scan(readings: Readings) -> list[Anomaly]:
     """Find groups of readings whose held-out residuals stand out, the most evident first.
 
-    At most `MAX_ANOMALIES`, each with a probability over `MIN_PROBABILITY`. Each round subtracts
-    from the residuals the deviation of one group: that which leaves least unexplained.
+    At most `MAX_ANOMALIES`, each with a probability over `MIN_PROBABILITY`. In each round the
+    deviation of one group is subtracted from the residuals: the one that leaves least unexplained.
     """
     units = units_of(readings)
     families = list(families_of(readings, units))
@@ -403,7 +403,7 @@ def _rows(found: _Found, readings: Readings) -> np.ndarray:
 
 
 def _without_group(readings: Readings, found: _Found) -> Readings:
-    """Subtract a group's deviation from its residuals; of blanks, set the excess to NaN."""
+    """Subtract a group's deviation from its residuals; if it is of blanks, set them to NaN."""
     rows = _rows(found, readings)
     if found.compared.statistic == "blanks":
         excess = readings.blank_excess.copy()

@@ -56,8 +56,8 @@ class CoverageGrid:
              height_m: float) -> "CoverageGrid":
         """Fill an area (x_min, x_max, y_min, y_max) [m] with cells from its south-west corner.
 
-        Receivers are at `height_m` above the ground [m]. A rest in the north and east that
-        is narrower than a cell has none. BadInput if no cell fits, or there are too many.
+        Receivers are at `height_m` above the ground [m]. A strip in the north or east that
+        is narrower than a cell is left out. BadInput if no cell fits, or there are too many.
         """
         x_min, x_max, y_min, y_max = bounds_m
         nx, ny = (np.floor((high - low) / step_m + 1e-9)

@@ -250,7 +250,7 @@ def source_of_map(radio_map: RadioMap, level: int,
     dataset = radio_map.dataset
 
     def read(name: str, row: int, index: np.ndarray) -> np.ndarray:
-        """Read a variable at the cells with flat indices (n,); reads no other rows."""
+        """Read a variable at the cells with flat indices (n,), from the rows that span them."""
         if not len(index):
             return np.empty(0)
         columns = dataset.sizes["x"]

@@ -125,7 +125,7 @@ def select(transmitters: list[Transmitter], names: list[str] | None) -> list[Tra
 
 def with_powers(transmitters: list[Transmitter], scene: Scene,
                 tx_power_dbm: float | None) -> list[Transmitter]:
-    """Return transmitters with a transmit power where they declare none: the given, or the scene's.
+    """Return transmitters with a power where they declare none: the given [dBm], else the scene's.
 
     BadInput if neither declares one.
     """

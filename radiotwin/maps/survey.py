@@ -233,7 +233,7 @@ def _lane_ends(shape: tuple[int, ...], battery: float, rng: np.random.Generator)
 
 def random_walk(grid: FlightGrid, start: Cell, battery: float, rng: np.random.Generator
                 ) -> list[Cell]:
-    """Move to a neighbour or hover, all equally probable, while the terminal stays in reach."""
+    """Return cells of moves and hovers, equally probable, while the terminal stays in reach."""
     cells, left = [start], battery
     while True:
         options = [(cell, MOVE_COST) for cell in grid.neighbours(cells[-1])]

@@ -118,8 +118,8 @@ class EffectData:
     def panels(self) -> list[tuple[str, np.ndarray]]:
         """Return title and link rows of each panel: up to `MAX_MEMBERS` devices or receivers.
 
-        They are those with the largest standard deviation of the effect's contribution, from
-        `MIN_SHARE` of the largest. Without a member kind there is one panel, of all links to draw.
+        They are those with the largest standard deviation of the contribution, over `MIN_SHARE` of
+        the maximum. An effect that is not on single ones has a panel of all links to draw.
         """
         shown, kind = self.shown, self.member_kind
         if not kind:
@@ -226,7 +226,7 @@ class BinMeans:
 
 
 def bin_index(value: np.ndarray, count: int) -> np.ndarray:
-    """Return the bin of each value (n,), all finite: up to `count` bins of about as many values.
+    """Return the bin of finite values (n,): up to `count` bins of about equally many values.
 
     If there are no more than `count` distinct values, each of them is a bin.
     """

@@ -184,8 +184,8 @@ def _evidence(effect: dict) -> str:
 def _error_table(report: dict, kinds: tuple[str, ...]) -> Table:
     """Return the table of held-out errors before and after effects were added, by group of links.
 
-    Groups are by `kinds` (`device`, `receiver`, `flight`, `los`), up to `MAX_ROWS` a kind, or the
-    kind is left out. With `los` all links come first, with other models.
+    `kinds` are `device`, `receiver`, `flight` or `los`; one of over `MAX_ROWS` groups is left out.
+    With `los`, all links come first, and other models on them.
     """
     rows: list[list[str]] = []
     others = dict(islice(report["baselines"].items(), MAX_MODELS if "los" in kinds else 0))

@@ -133,9 +133,7 @@ def _judge_also(paths: list[Path], truth: RadioMap | None, held_out: list[str],
     """Read further twins and radio maps to compare with the models, each named by its path.
 
     Warns if a twin was fitted to a flight in `held_out`, which makes its error look too small.
-
-    Raises:
-        BadInput: a radio map without a truth map, on which alone it can be judged.
+    BadInput for a radio map without a truth map.
     """
     twins, maps = {}, {}
     for path in paths:

@@ -266,8 +266,7 @@ def read_run(folder: Path | str, scene: Path | None = None, truth: str | None = 
 def _first(folder: Path, *names: str) -> Path | None:
     """Return the first of the named files (or .zarr folders) that a folder holds; else None.
 
-    Raises:
-        BadInput: a link leads out of the folder.
+    BadInput if it is a link that leads out of the folder.
     """
     found = next((folder / name for name in names if os.path.isfile(folder / name)
                   or (name.endswith(ZARR) and os.path.isdir(folder / name))), None)

@@ -147,7 +147,7 @@ def _how_sure(device: dict, origin: Origin | None) -> str:
 
 
 def _facts(run: Run) -> list[str]:
-    """Return the footer: version, scene, carrier, credit of the map, source of each radio map."""
+    """Return the footer: version, scene, frequency, credit of the map, source of each radio map."""
     facts = [f"radiotwin {__version__}"]
     if run.scene:
         config = run.scene.config

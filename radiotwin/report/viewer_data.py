@@ -305,8 +305,8 @@ def _field(label: str, quantity: str, level_db: np.ndarray, kind: str, unit: str
 def _error_db(radio_map: RadioMap, truth: RadioMap, step: int) -> np.ndarray:
     """Subtract true gains from a model's [dB] (device, z, y, x); NaN for devices not in `truth`.
 
-    `radio_map` was thinned to every `step`-th position in x and y; `truth` is thinned here. A model
-    with `sigma_db` is compared by its mean over detected levels: a truth without it has no others.
+    `radio_map` was thinned to every `step`-th position in x and y; `truth` is thinned here. If
+    only the model has `sigma_db`, its mean given detection is compared (see `comparable_db`).
     """
     error_db = np.full(radio_map.gain_db.shape, np.nan)
     model_db, true_db = comparable_db(radio_map, truth), truth.gain_db[..., ::step, ::step]
