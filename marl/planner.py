@@ -127,29 +127,29 @@ class Search(NamedTuple):
     """Tours that are annealed, and their flight.
 
     Attributes:
-        tour, count: present tours, see `Plan`.
-        best_tour, best_count: the best so far.
+        tour, visits: present tours, see `Plan`.
+        best_tour, best_visits: the best so far.
         share: (2,) share of the data that the present tours collect, and the best.
         course: simulated flight of the present tours.
         trial: the same, for changed tours.
     """
 
     tour: np.ndarray
-    count: np.ndarray
+    visits: np.ndarray
     best_tour: np.ndarray
-    best_count: np.ndarray
+    best_visits: np.ndarray
     share: np.ndarray
     course: Course
     trial: Course
 
     @classmethod
-    def of(cls, mission: Mission, candidates: Candidates, tour: np.ndarray, count: np.ndarray,
+    def of(cls, mission: Mission, candidates: Candidates, tour: np.ndarray, visits: np.ndarray,
            ) -> "Search":
         """Return a search that begins with tours (U, W, 3) and (U,), which it does not change."""
         course = Course.of(mission, tour.shape[1])
-        share = _fly_tours(mission, candidates, tour, count, course)
-        return cls(tour.copy(), count.copy(), tour.copy(), count.copy(), np.full(2, share), course,
-                   Course(*(array.copy() for array in course)))
+        share = _fly_tours(mission, candidates, tour, visits, course)
+        return cls(tour.copy(), visits.copy(), tour.copy(), visits.copy(), np.full(2, share),
+                   course, Course(*(array.copy() for array in course)))
 
 
 class PlanPolicy:
@@ -254,9 +254,9 @@ def improve(mission: Mission, candidates: Candidates, tour: np.ndarray, count: n
         _anneal(mission, candidates, search, only, temperature,
                 np.arange(start, stop) / iterations, rng)
         on_progress(stop - start)
-    flight = expected_flight(mission, candidates.value, search.best_tour, search.best_count)
+    flight = expected_flight(mission, candidates.value, search.best_tour, search.best_visits)
     ratio = 1.0 - flight.left[-1].sum() / mission.data_units.sum()
-    return Plan(flight.action, float(ratio), search.best_tour, search.best_count)
+    return Plan(flight.action, float(ratio), search.best_tour, search.best_visits)
 
 
 def expected_data(mission: Mission) -> np.ndarray:
@@ -465,7 +465,7 @@ def _anneal(mission: Mission, candidates: Candidates, search: Search, only: int,
     `progress` (n,) is that of the annealing at every step, 0 to 1; see `improve` for the others.
     """
     tour, count, share, course, trial = (
-        search.tour, search.count, search.share, search.course, search.trial)
+        search.tour, search.visits, search.share, search.course, search.trial)
     (slots, uavs), cold = course.place.shape, END_TEMPERATURE / len(course.left)
     mask, scratch = np.empty(ACTION_COUNT, np.bool_), np.zeros((2, uavs), np.int64)
     holder = np.full(len(course.left), -1)
@@ -513,4 +513,4 @@ def _anneal(mission: Mission, candidates: Candidates, search: Search, only: int,
             share[0] = new
             if new > share[1]:
                 share[1] = new
-                search.best_tour[:], search.best_count[:] = tour, count
+                search.best_tour[:], search.best_visits[:] = tour, count

@@ -399,7 +399,7 @@ def _check_sizes(features: list[Feature], origin: Origin, path: Path) -> None:
 def _check_width(width_m: float, max_m: float) -> None:
     """Raise BadInput if an area is wider than allowed [m]."""
     if not width_m <= max_m:  # also for NaN
-        raise BadInput(f"the area is {width_m / 1000:.0f} km wide, {MAX_WIDTH_M / 1000:g} km are "
+        raise BadInput(f"the area is {width_m / 1000:.0f} km wide, {max_m / 1000:g} km are "
                        "allowed; choose a part with --bbox SOUTH,WEST,NORTH,EAST")
 
 
