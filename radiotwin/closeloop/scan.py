@@ -307,8 +307,8 @@ def log_odds_of_groups(readings: Readings, families: list[Family], units: Units)
                 odds = ODDS.get(family.name, FAMILY_ODDS)
                 odds /= family_count[family.name, family.curve is None]
                 if len(parts) > 1:
-                    both = PLACE_BOTH if family.name == "place" else BOTH_SHARE
-                    odds *= both if name == "all" else (1 - both) / 2
+                    both_share = PLACE_BOTH if family.name == "place" else BOTH_SHARE
+                    odds *= both_share if name == "all" else (1 - both_share) / 2
                 log_odds = part.log_odds(outlier, odds)
                 if statistic != "level":  # less scatter, or fewer blanks, is no fault
                     log_odds = np.where(part.size > 0, log_odds, -np.inf)
@@ -450,9 +450,9 @@ def _anomaly(found: _Found, readings: Readings) -> Anomaly:
     if compared.family.name in ENDS:  # also name another end that has exactly the same links
         labels = {end: getattr(readings, end) for end in ENDS}
         for other in (end for end in ENDS if end != compared.family.name):
-            same = inseparable_pairs(labels[compared.family.name], labels[other])
-            if found.group in same:
-                members = {**members, other: (readings.names[other][same[found.group]],)}
+            partner = inseparable_pairs(labels[compared.family.name], labels[other])
+            if found.group in partner:
+                members = {**members, other: (readings.names[other][partner[found.group]],)}
     value, distance = found.deviation, compared.distance
     if isinstance(distance, Curves):
         low, high = (float(distance.sd(share)[found.group]) for share in (0.05, 0.95))

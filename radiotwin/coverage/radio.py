@@ -140,9 +140,9 @@ def channel_overlap(frequencies_hz: np.ndarray, bandwidth_hz: float,
     nothing else. Of centre frequencies (f,) [Hz], rows of the result (f, f) are receivers, columns
     transmitters.
     """
-    apart = np.abs(frequencies_hz[:, None] - frequencies_hz) / bandwidth_hz
-    inside = np.clip(1 - apart, 0, 1)
-    near = np.clip(LEAKAGE_CHANNELS + 1 - apart, 0, 1)  # within the channel or adjacent ones
+    offset = np.abs(frequencies_hz[:, None] - frequencies_hz) / bandwidth_hz
+    inside = np.clip(1 - offset, 0, 1)
+    near = np.clip(LEAKAGE_CHANNELS + 1 - offset, 0, 1)  # within the channel or adjacent ones
     return inside + (near - inside) * 10 ** (-aclr_db / 10)
 
 

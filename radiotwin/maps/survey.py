@@ -185,9 +185,9 @@ def random_waypoint(grid: FlightGrid, start: Cell, battery: float, rng: np.rando
     """Return the cells of a flight to random cells and home, as far as the battery allows."""
     cells = [start]
     while True:
-        left = battery - MOVE_COST * (len(cells) - 1)
+        charge = battery - MOVE_COST * (len(cells) - 1)
         steps = grid.steps_to(cells[-1]) + grid.steps_to(grid.terminal)
-        reachable = steps <= left / MOVE_COST
+        reachable = steps <= charge / MOVE_COST
         reachable[cells[-1]] = False
         if not reachable.any():
             return cells + grid.path(cells[-1], grid.terminal, rng)
@@ -234,17 +234,17 @@ def _lane_ends(shape: tuple[int, ...], battery: float, rng: np.random.Generator)
 def random_walk(grid: FlightGrid, start: Cell, battery: float, rng: np.random.Generator
                 ) -> list[Cell]:
     """Return cells of moves and hovers, equally probable, while the terminal stays in reach."""
-    cells, left = [start], battery
+    cells, charge = [start], battery
     while True:
         options = [(cell, MOVE_COST) for cell in grid.neighbours(cells[-1])]
         options.append((cells[-1], HOVER_COST))
         safe = [(cell, cost) for cell, cost in options
-                if grid.steps_home(cell) * MOVE_COST <= left - cost]
+                if grid.steps_home(cell) * MOVE_COST <= charge - cost]
         if not safe:
             return cells
         cell, cost = safe[rng.integers(len(safe))]
         cells.append(cell)
-        left -= cost
+        charge -= cost
 
 
 PATTERNS = {"random-waypoint": random_waypoint, "lawnmower": lawnmower, "random-walk": random_walk}

@@ -110,10 +110,10 @@ def pattern_figure(effect: EffectData, _: MapBackground) -> Figure:
                 label="mean residual without the effect")
         ax.errorbar(azimuth, found.mean, yerr=found.error, fmt="none", color=BEFORE, elinewidth=1)
         ax.plot(*_closed_curve(fitted), color=AFTER, linewidth=2, label="fitted")
-        both = np.concatenate([found.mean, fitted.mean])
-        if len(both):
-            span_db = max(np.ptp(both), 3.0)
-            ax.set_ylim(both.min() - 0.35 * span_db, both.max() + 0.05 * span_db)
+        means_db = np.concatenate([found.mean, fitted.mean])
+        if len(means_db):
+            span_db = max(np.ptp(means_db), 3.0)
+            ax.set_ylim(means_db.min() - 0.35 * span_db, means_db.max() + 0.05 * span_db)
         ax.set_rlabel_position(22.5)  # type: ignore[attr-defined]
         ax.yaxis.set_major_locator(MaxNLocator(4))
         ax.tick_params(axis="y", labelsize=7)
@@ -414,10 +414,10 @@ def _connect(ax: Axes, position: int, level: float) -> None:
 def _draw_lines(ax: Axes, lines: list[tuple[float, str, str]]) -> None:
     """Draw horizontal lines (value, name, style) with labels at the right that do not overlap."""
     top, last = ax.get_ylim()[1], -np.inf
-    apart = min(0.085, 1 / max(len(lines), 1)) * top
-    for left, (value, name, style) in zip(range(len(lines) - 1, -1, -1), sorted(lines)):
+    spacing = min(0.085, 1 / max(len(lines), 1)) * top
+    for above, (value, name, style) in zip(range(len(lines) - 1, -1, -1), sorted(lines)):
         ax.axhline(value, color="0.45", linewidth=0.9, linestyle=style, zorder=1)
-        last = min(max(value, last + apart), top - left * apart)  # room for those above it
+        last = min(max(value, last + spacing), top - above * spacing)  # room for labels above
         ax.annotate(f"{name} {value:.2f}", (1.0, last), xycoords=("axes fraction", "data"),
                     xytext=(4, 0), textcoords="offset points", va="center", fontsize=9, color="0.3",
                     annotation_clip=False)

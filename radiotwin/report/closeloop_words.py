@@ -110,9 +110,10 @@ def _object_words(effect: dict, origin: Origin | None) -> str:
         words += f", {values['height_m']:.0f} m high"
     if len(members) == 1:
         (member,) = members
-        wide, towards = (values.get(f"{each}_deg[{member}]") for each in ("beamwidth", "azimuth"))
-        if wide is not None and towards is not None:
-            words += f", {wide:.0f}° wide, towards {towards % 360:.0f}°"
+        width_deg, azimuth_deg = (values.get(f"{each}_deg[{member}]")
+                                  for each in ("beamwidth", "azimuth"))
+        if width_deg is not None and azimuth_deg is not None:
+            words += f", {width_deg:.0f}° wide, towards {azimuth_deg % 360:.0f}°"
     places = [each for each in effect.get("places", []) if each.get("device", "") in ("", *members)]
     return words + (f", at {place_words(places[0]['x_m'], places[0]['y_m'], origin)}"
                     if len(places) == 1 else "")
@@ -298,16 +299,17 @@ def _effect_words(report: dict) -> str:
     goes = f"{'falls' if after < before else 'goes'} from {number(before)} to {number(after)} dB"
     if number(before) == number(after):
         goes = f"stays at {number(after)} dB"
-    of = ""
+    of_links = ""
     if "after_same_links" in error:  # the RMSE is of the base's links, unless interpolated
-        of = (f" (the last of all {error['after']['n']:,} links)" if explained and interpolated
-              else f" (the same {error['before']['n']:,} links)")
+        of_links = (
+            f" (the last of all {error['after']['n']:,} links)" if explained and interpolated
+            else f" (the same {error['before']['n']:,} links)")
     text = (f"{start}: {'; '.join(objects(report))}{sure}. With {it} the RMSE on held-out links "
-            f"{goes}{of}.")
-    left = _unnamed_beside(report)
-    if left is not None:
+            f"{goes}{of_links}.")
+    unnamed = _unnamed_beside(report)
+    if unnamed is not None:
         text += (f" Beside {it} something is left that has no name (probability "
-                 f"{probability(left)}).")
+                 f"{probability(unnamed)}).")
     if report["remaining"]["drivers"]:
         text += f" The remaining residual depends on {join_names(drivers(report))}."
     return text
