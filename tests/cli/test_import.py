@@ -6,7 +6,6 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from radiotwin.cli.importing import _tables
@@ -18,82 +17,34 @@ SAMPLES = Path(__file__).parents[1] / "importing" / "samples"
 FILES = ["devices.csv", "frame.toml", "import.json", "import.toml", "measurements.csv"]
 
 
-@pytest.fixture
-def example(run, tmp_path):
-    """Import a sample with its worked mapping, twice: with the example, and with what the first import has saved."""
-    def example(name: str, options: str = ""):
-        file = shlex.quote(str(SAMPLES / f"{name}.csv"))
-        first = run(f"import {file} --columns {shlex.quote(str(EXAMPLES / name))}.toml {options} -o out", tmp_path)
-        assert first.returncode == 0, first.stderr
-        again = run(f"import {file} --columns out/import.toml -o again", tmp_path)
-        assert again.returncode == 0, again.stderr
-        assert sorted(path.name for path in (tmp_path / "out").iterdir()) == FILES
-        for name in FILES:
-            assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
-        report = json.loads((tmp_path / "out" / "import.json").read_text())
-        left_out = Counter()
-        for item in report["left_out"]:
-            left_out[item["reason"]] += item["readings"]
-        assert report["readings"] == report["kept"] + sum(left_out.values())
-        return read_measurements(tmp_path / "out" / "measurements.csv"), report, left_out, first.stdout
-    return example
+EXAMPLE = {  # options, what is left out and why, devices and levels of the links
+    "duke_cbrs": ("--devices {}/duke_cbrs_sectors.csv", {"repeats an earlier row exactly": 1}, "C A C A", [-112, -98, -107, -121]),
+    "powder_frs": ("--receivers {}/powder_frs_receivers.csv", {"not measured": 4}, "p1 p1 p2 p2 p2 p1 p1 p1", None),
+    "drive_test": ("--devices {}/drive_test_sites.csv", {"impossible level": 1, "no device": 1, "nearer than 100.0 m": 1},
+                   "111 111 222", [10 * np.log10(1.1e-9 / 3), -95, np.nan]),
+    "uav_log": ("", {}, None, [-71.5, np.nan, -73])}
 
 
-def test_duke_cbrs(example):
-    measurements, report, left_out, printed = example(
-        "duke_cbrs", f"--devices {shlex.quote(str(SAMPLES / 'duke_cbrs_sectors.csv'))}")
-    table, devices = measurements.table, measurements.devices.set_index("device")
-    assert list(table["rssi_dbm"]) == [-112, -98, -107, -121] and list(table["device"]) == ["C", "A", "C", "A"]
-    assert list(table["receiver"]) == list(table["flight"]) == ["Samsung", "Samsung", "Pixel", "Pixel"]
-    assert set(table["receiver_z_m"]) == {1.5} and left_out == {"repeats an earlier row exactly": 1}
-    assert devices.loc["C", ["z_m", "role", "frequency_hz"]].tolist() == [24, "anchor", 3.58e9]
-    apart_m = measurements.receiver_m - measurements.device_m[measurements.device_index]
-    assert np.allclose(apart_m[0, :2], [1e-3 * 90_165, 2e-3 * 110_960], rtol=1e-3)  # metres a degree at 36° north
-    assert "4 links, 0 not detected; 2 devices (2 anchors), 2 receivers, 2 flights" in printed
-    assert "origin: latitude 36.0015" in printed
-
-
-def test_powder_frs(example):
-    measurements, report, left_out, printed = example(
-        "powder_frs", f"--receivers {shlex.quote(str(SAMPLES / 'powder_frs_receivers.csv'))}")
-    table = measurements.table
-    assert report["rows"] == 3 and report["readings"] == 12 and left_out == {"not measured": 4}
-    assert list(table["device"]) == ["p1", "p1", "p2", "p2", "p2", "p1", "p1", "p1"]
-    assert sorted(set(table["receiver"])) == ["bus-4407", "cbrssdr1-hill-comp", "cnode-yard-dd-b210", "roof-nuc1-b210"]
-    assert measurements.flights == ["2022-11-23", "2022-07-11"]
-    assert table["time_s"].iloc[0] == pd.Timestamp("2022-11-23 13:24:40-07:00").timestamp()
-    assert table["time_s"].iloc[-1] == pd.Timestamp("2022-07-11 08:49:44-06:00").timestamp()
-    assert measurements.is_anchor.all() and set(measurements.devices["frequency_hz"]) == {462.7e6}
-    bus = table[table["receiver"] == "bus-4407"]
-    assert np.diff(bus["receiver_y_m"])[0] == pytest.approx(111.05, abs=0.1) and len(bus) == 2
-    assert table["receiver_z_m"].isna().all()
-
-
-def test_drive_test(example):
-    measurements, report, left_out, printed = example(
-        "drive_test", f"--devices {shlex.quote(str(SAMPLES / 'drive_test_sites.csv'))}")
-    table = measurements.table
-    assert left_out == {"impossible level": 1, "no device": 1, "nearer than 100.0 m": 1}
-    assert list(table["device"]) == ["111", "111", "222"] and list(table["quality"]) == [3, 1, 1]
-    power = np.array([1e-9, 1e-10, 0]).mean()
-    np.testing.assert_allclose(table["rssi_dbm"], [10 * np.log10(power), -95, np.nan], atol=1e-4)
-    assert set(table["receiver_z_m"]) == {2.5} and set(table["flight"]) == {"2023-07-04"}
-    assert table["time_s"].iloc[0] == pd.Timestamp("2023-07-04 07:00:01Z").timestamp()
-    assert measurements.devices[["role", "z_m"]].values.tolist()[0] == ["anchor", 30.48]
-    assert measurements.devices["role"].tolist() == ["anchor", "unknown"]
-    assert "impossible level" in printed and "row 9" in printed
-
-
-def test_uav_log(example):
-    measurements, report, left_out, printed = example("uav_log")
-    table = measurements.table
-    assert left_out == {} and report["not_detected"] == 1
-    np.testing.assert_array_equal(table["rssi_dbm"], [-71.5, np.nan, -73])
-    np.testing.assert_allclose(table["receiver_z_m"], [60, 60, 60.12], atol=1e-3)
-    np.testing.assert_allclose(table["receiver_y_m"], [0, 11.12, 22.24], atol=0.01)
-    assert list(table["heading_deg"]) == [350, 10, 20] and list(table["roll_deg"]) == [-1, -1, 0]
-    assert list(table["time_s"]) == [1688461200, 1688461200.5, 1688461201]
-    assert measurements.devices["role"].tolist() == ["unknown"]
+@pytest.mark.parametrize("name", EXAMPLE)
+def test_a_worked_example_and_again_with_what_was_saved(run, tmp_path, name):
+    options, left_out, devices, level_dbm = EXAMPLE[name]
+    file = shlex.quote(str(SAMPLES / f"{name}.csv"))
+    first = run(f"import {file} --columns {shlex.quote(str(EXAMPLES / name))}.toml {options.format(SAMPLES)} -o out", tmp_path)
+    assert first.returncode == 0, first.stderr
+    assert run(f"import {file} --columns out/import.toml -o again", tmp_path).returncode == 0
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == FILES
+    for each in FILES:
+        assert (tmp_path / "out" / each).read_bytes() == (tmp_path / "again" / each).read_bytes(), each
+    report = json.loads((tmp_path / "out" / "import.json").read_text())
+    found = Counter()
+    for item in report["left_out"]:
+        found[item["reason"]] += item["readings"]
+    assert found == left_out and report["readings"] == report["kept"] + sum(left_out.values())
+    measurements = read_measurements(tmp_path / "out" / "measurements.csv")
+    assert devices is None or list(measurements.table["device"]) == devices.split()
+    if level_dbm is not None:
+        np.testing.assert_allclose(measurements.level_db, level_dbm, atol=1e-4)
+    assert f"{len(measurements)} links, " in first.stdout and all(reason in first.stdout for reason in left_out)
 
 
 GOOD = "time,lat,lon,cell,rsrp\n2022-10-30 12:00:00,48.1,11.5,a,-80\n2022-10-30 12:00:01,48.2,11.6,a,-99\n"
