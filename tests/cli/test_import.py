@@ -139,8 +139,8 @@ def test_a_spectrum_scan_in_a_band(run, tmp_path):
 
 
 def test_two_files_with_the_track_that_their_settings_name(run, tmp_path):
-    for name in ("a.csv", "b.csv"):
-        (tmp_path / name).write_text("t,l\n1709287200,-80\n1709287201,-81\n")
+    for name, level in (("a.csv", -80), ("b.csv", -90)):
+        (tmp_path / name).write_text(f"t,l\n1709287200,{level}\n1709287201,{level - 1}\n")
     (tmp_path / "flight.csv").write_text("time_s,latitude,longitude\n1709287199,48.1,11.5\n1709287202,48.2,11.5\n")
     (tmp_path / "own.toml").write_text('level_unit = "dBm"\ntime_format = "epoch s"\nlength_unit = "m"\n[columns]\nlevel = "l"\n'
                                        'time = "t"\ndevice = "always x"\n[[track]]\nfile = "flight.csv"\n')
