@@ -132,13 +132,7 @@ def _unpacked(value: Any, arrays: dict[str, np.ndarray]) -> Any:
 
 @dataclass(frozen=True)
 class Within:
-    """Form of an array: type and shape of another one, and a range of values without NaN.
-
-    Attributes:
-        like: array of that type and shape.
-        low: least value, broadcast to the shape.
-        high: greatest value, broadcast to the shape.
-    """
+    """Form of an array: type and shape `like` another one, and a range of values without NaN."""
 
     like: np.ndarray
     low: ArrayLike

@@ -381,10 +381,6 @@ class QMIX(Learner):
 
     After every block of `federate_every` episodes the present policy is evaluated in the map it is
     trained in. The best policy so far, earlier rounds included, is the learner's policy.
-
-    Attributes:
-        mission: mission in the present map.
-        episodes: training episodes so far.
     """
 
     networks: Callable[..., QNetworks] = QNetworks

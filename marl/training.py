@@ -50,14 +50,10 @@ class Exploration:
 
 
 class Replay:
-    """Replay memory of the last `capacity` flights, allocated once.
+    """Replay memory of the last `capacity` flights, now `size`, allocated once.
 
     It stores frames, from which features are computed when they are sampled. Frames take a fifth of
     the memory, and features of flights in an earlier twin use today's known positions.
-
-    Attributes:
-        capacity: largest number of flights.
-        size: present number of flights.
     """
 
     def __init__(self, capacity: int, mission: Mission) -> None:
