@@ -94,15 +94,14 @@ class Replicas:
         Raises:
             RunFailed: a process has ended.
         """
-        count = len(self._local or self._pools)
-        further = [()] * count if each is None else [(one,) for one in each]
+        given = [arguments] * len(self._local or self._pools) if each is None else \
+            [(*arguments, one) for one in each]
         if self._local:
-            return [getattr(trainer, method)(*arguments, *one)
-                    for trainer, one in zip(self._local, further)]
+            return [getattr(trainer, method)(*own) for trainer, own in zip(self._local, given)]
         for begun in self._begun:
             result_of(begun)
-        return [result_of(call) for call in [pool.submit(_call, method, (*arguments, *one))
-                                             for pool, one in zip(self._pools, further)]]
+        calls = [pool.submit(_call, method, own) for pool, own in zip(self._pools, given)]
+        return [result_of(call) for call in calls]
 
     def close(self) -> None:
         """Kill the processes."""
