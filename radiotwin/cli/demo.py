@@ -1,15 +1,18 @@
 """The whole chain on a small scene: build, trace, survey, fit, compare, and one page of it all."""
 
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
 from radiotwin.errors import BadInput, optional_package
+from radiotwin.geo import to_geographic
 from radiotwin.maps.survey import fly_survey
 from radiotwin.report import read_run, write_comparison_folder, write_picture, write_report
 from radiotwin.runtime.cuda import Device
 from radiotwin.scene import Scene
-from radiotwin.scene.build import BuildOptions, build_scene
 from radiotwin.scene.presets import build_preset
+from radiotwin.scene.readers import build_scene
+from radiotwin.scene.readers.build import map_suffix
 from radiotwin.trace import SolverSettings, trace_map
 from radiotwin.twin.compare import Comparison, compare_models, split_flights
 
@@ -76,14 +79,25 @@ def _scene(source: str, folder: Path, seed: int, on_progress: Callable[[str], No
     if source.startswith("preset:"):
         build_preset(source.removeprefix("preset:"), folder)
     else:
-        build_scene(source, folder, BuildOptions(bbox=_middle(source, folder), devices=DEVICES,
-                                                 seed=seed, materials=ROOF_MATERIALS.get(source)))
+        build_scene(source, folder, bbox=_middle(source), devices=DEVICES, seed=seed,
+                    materials=ROOF_MATERIALS.get(source))
     return Scene.load(folder)
 
 
-def _middle(source: str, folder: Path) -> tuple[float, float, float, float]:
-    """Return x_min, y_min, x_max, y_max [m] of a square of `SIDE_M` in the middle of a city."""
-    x_min, x_max, y_min, y_max = build_scene(source, folder, check_only=True).extent_m
+def _middle(source: str) -> tuple[float, float, float, float]:
+    """Return a square of `SIDE_M` in the middle of a city, as `bbox` of `build_scene`.
+
+    That is x_min, y_min, x_max, y_max [m]; of a map south, west, north, east [degrees].
+    """
+    is_map = map_suffix(source) is not None
+    with tempfile.TemporaryDirectory(prefix="radiotwin-") as scratch:
+        report = build_scene(source, Path(scratch) / "scene", check_only=not is_map)
+        origin = Scene.load(Path(scratch) / "scene").config.origin if is_map else None
+    x_min, x_max, y_min, y_max = report.extent_m
     x_m, y_m = round((x_min + x_max) / 40) * 20, round((y_min + y_max) / 40) * 20  # multiple of 20
     half_x_m, half_y_m = min(SIDE_M, x_max - x_min) / 2, min(SIDE_M, y_max - y_min) / 2
-    return x_m - half_x_m, y_m - half_y_m, x_m + half_x_m, y_m + half_y_m
+    west, east, south, north = x_m - half_x_m, x_m + half_x_m, y_m - half_y_m, y_m + half_y_m
+    if origin is None:
+        return west, south, east, north
+    (west, east), (south, north) = to_geographic(origin, [west, east], [south, north])
+    return south, west, north, east
