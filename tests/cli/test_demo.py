@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from radiotwin.cli.demo import _middle
 from radiotwin.trace import SolverSettings
 
 MATERIAL = '<bsdf type="itu-radio-material" id="concrete"><string name="type" value="concrete"/></bsdf>'
@@ -46,3 +47,11 @@ def test_the_whole_chain_ends_in_a_page(run, city_xml, monkeypatch):
 
     again = run("demo --scene preset:small -o out", cwd=folder)
     assert again.returncode == 2 and "choose another folder" in again.stderr
+
+
+def test_a_map_gives_the_square_in_its_middle_in_degrees(monkeypatch):
+    monkeypatch.setattr("radiotwin.cli.demo.SIDE_M", 120.0)
+    south, west, north, east = _middle("examples/campaign/town.geojson")
+    across = np.radians([north - south, (east - west) * np.cos(np.radians(south))]) * 6_371_000
+    assert across == pytest.approx([120, 120], rel=0.005)
+    assert 47.0505 < south < north < 47.0533 and 8.3007 < west < east < 8.3048, "the town's"
