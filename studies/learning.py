@@ -1,4 +1,4 @@
-"""Algorithm 1 and what it is compared with: `curve`."""
+"""Algorithm 1 and what it is compared with: `curve`, `federation`, `tuning`."""
 
 from pathlib import Path
 from typing import Any
@@ -99,6 +99,36 @@ def curve_cases(seed: int) -> dict[str, dict]:
     return named_cases(CITIES, "traced", traced) | named_cases(PAPER_MAPS, "segmented", kinds)
 
 
+def federation_cases(seed: int) -> dict[str, dict]:
+    """Return FedQMIX and QMIX at equal simulated episodes of a replica, in all, and in equal time.
+
+    Exploration fades over the same share of training in all. Equal time is that of one core (equal
+    in all), of three or more (equal of a replica), and of two, where three replicas take 1.6 times
+    as long as one (study `speed`: 3 / 1.87).
+    """
+    episodes = {"fedqmix-3x800": 800, "qmix-800": 800, "fedqmix-3x267": 267, "qmix-1280": 1280,
+                "qmix-2400": 2400, "fedqmix-3x800-weights": 800}
+    return named_cases(CITIES, "segmented", {name: {
+        "algorithm": name.split("-")[0], "episodes": count,
+        "federate_all": not name.endswith("weights"),
+        "epsilon_slots": round(PRESETS["fast"].epsilon_slots * count / 800)}
+        for name, count in episodes.items()})
+
+
+def tuning_cases(seed: int) -> dict[str, dict]:
+    """Return one change at a time; the rows `earlier` are changes of what the preset was before.
+
+    The record has rows of options, too, that did not pay and that version 0.1 had.
+    """
+    slot, policy = {"twin_shadowing": "slot"}, {"measure": "policy"}
+    earlier = policy | slot | {"first_flight": "random"}
+    kinds: dict[str, dict] = {
+        "as-it-is": {}, "shadowing-slot": slot, "measure-policy": policy, "earlier": earlier,
+        "earlier-excursions-1": earlier | {"excursion_slots": 1.0}}
+    return named_cases(CITIES, "traced", {name: {"algorithm": "qmix"} | changes
+                                          for name, changes in kinds.items()})
+
+
 def curve_table(rows: pd.DataFrame) -> str:
     """Return what is collected at the end, and the real episodes that the same ratio takes."""
     parts = []
@@ -139,6 +169,48 @@ def factors(curves: dict[str, Curve], target: float) -> str:
             f"{'; '.join(texts)}.") if texts and real == real else ""
 
 
+def federation_table(rows: pd.DataFrame) -> str:
+    """Return FedQMIX and QMIX by simulated episodes."""
+    heads = ["", "episodes of a replica", "simulated in all", "CPU s", "collected", "seeds"]
+    parts = []
+    for title, runs in worlds(rows):
+        lines = {}
+        for name, seeds in runs.items():
+            settings = seeds["settings"].iloc[0]
+            simulated = last(seeds["curve"], "simulated_episodes")[0]
+            lines[simulated, name] = [
+                name, f"{settings['episodes'] * settings['real_episodes']:,}", f"{simulated:,}",
+                number(seeds["cpu_s"].mean(), 0), with_sd(last(seeds["curve"])), str(len(seeds))]
+        parts.append(markdown(heads, [lines[key] for key in sorted(lines)],
+                              f"{title}, 10 real episodes"))
+    return "\n\n".join(parts) + (
+        "\n\nEqual for a replica: `fedqmix-3x800` and `qmix-800` (equal time where there are three "
+        "cores). Equal in all: `fedqmix-3x267` and `qmix-800`, `fedqmix-3x800` and `qmix-2400` "
+        "(equal time on one core). Equal time on two cores: `fedqmix-3x800` and `qmix-1280`. "
+        "`weights`: moments and target networks are not averaged.")
+
+
+def options(settings: dict, hidden: tuple[str, ...] = ("scene", "truth", "algorithm"),
+            **changed: Any) -> str:
+    """Return the settings that differ from the defaults (some `changed`), as options."""
+    defaults = RunSettings(planner_iterations=PLANNER_ITERATIONS).model_dump(mode="json") \
+        | LearnerSettings().model_dump() | changed
+    given = [f"--{name.replace('_', '-')} {str(value).lower()}" for name, value in settings.items()
+             if name not in hidden and value != defaults.get(name)]
+    return f"`{' '.join(given)}`" if given else "as it is"
+
+
+def tuning_table(rows: pd.DataFrame) -> str:
+    """Return one change at a time."""
+    heads = ["options", "collected", "in the twin", "worst position error at the end [m]", "seeds"]
+    return "\n\n".join(markdown(heads, [
+        [options(seeds["settings"].iloc[0]),
+         *(with_sd(last(seeds["curve"], column)) for column in ("truth_ratio", "twin_ratio")),
+         f"{np.mean(last(seeds['curve'], 'location_error_worst_m')):,.0f}", str(len(seeds))]
+        for seeds in runs.values()], f"{title}, model-aided QMIX")
+        for title, runs in worlds(rows))
+
+
 def curve_figures(rows: pd.DataFrame) -> dict[str, Figure]:
     """Draw collected data against real episodes, a panel a world; and the flights of FedQMIX."""
     found = list(worlds(rows))
@@ -172,5 +244,24 @@ def _draw_flight(row: Any) -> Figure:
     return figure
 
 
-STUDIES = {"curve": Study("How much is collected after how many real episodes?", learn,
-                          curve_cases, curve_table, curve_figures)}
+def federation_figures(rows: pd.DataFrame) -> dict[str, Figure]:
+    """Draw collected data over the episodes of a replica, and over all."""
+    found = list(worlds(rows))
+    figure, panels = tables.make_panels(2 * len(found), 2, 4.1)
+    for row, (title, runs) in enumerate(found):
+        for axes, of in zip(panels[2 * row:], ("a replica", "all replicas")):
+            for index, (name, seeds) in enumerate(runs.items()):
+                curve = over_seeds(seeds["curve"], x="simulated_episodes")
+                share = 3 if name.startswith("fedqmix") and of == "a replica" else 1
+                tables.draw_line(axes, curve._replace(x=curve.x / share), name, index)
+            axes.set(xlabel=f"simulated episodes of {of}", ylabel=RATIO, title=title)
+    return {"federation": tables.with_legend(figure, panels, 3)}
+
+
+STUDIES = {
+    "curve": Study("How much is collected after how many real episodes?", learn, curve_cases,
+                   curve_table, curve_figures),
+    "federation": Study("Does averaging replicas pay?", learn, federation_cases, federation_table,
+                        federation_figures),
+    "tuning": Study("What brings the learner nearer to the planner?", learn, tuning_cases,
+                    tuning_table)}

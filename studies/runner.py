@@ -21,7 +21,8 @@ from radiotwin.io.files import atomic_path
 from radiotwin.runtime.execution import Job, open_executor
 
 SCHEMA, RECORDS = "radiotwin.study/1", Path(__file__).parents[1] / "docs" / "results"
-MODULES = {"models": "models", "curve": "learning", "belief": "belief", "foreign": "foreign",
+MODULES = {"models": "models", "curve": "learning", "federation": "learning",
+           "tuning": "learning", "belief": "belief", "foreign": "foreign",
            "where": "where", "hidden": "closeloop", "calibration": "calibration",
            "real": "closeloop_real", "injected": "injected", "campus": "campus",
            "away": "campus_learning", "readings": "campus_learning", "speed": "speed"}

@@ -85,17 +85,16 @@ class Curve(NamedTuple):
         return float(self.x[enough[0]]) if len(enough) else np.nan
 
 
-def over_seeds(curves: pd.Series) -> Curve:
+def over_seeds(curves: pd.Series, x: str = "real_episodes", y: str = "truth_ratio") -> Curve:
     """Return the curve of a row's seeds, as long as the shortest."""
-    length = min(len(curve["real_episodes"]) for curve in curves)
-    xs, ys = (np.array([curve[key][:length] for curve in curves], dtype=float)
-              for key in ("real_episodes", "truth_ratio"))
+    length = min(len(curve[x]) for curve in curves)
+    xs, ys = (np.array([curve[key][:length] for curve in curves], dtype=float) for key in (x, y))
     return Curve(xs.mean(axis=0), ys.mean(axis=0), sd(ys))
 
 
-def last(curves: pd.Series) -> list[float]:
-    """Return the last share of each curve."""
-    return [curve["truth_ratio"][-1] for curve in curves]
+def last(curves: pd.Series, column: str = "truth_ratio") -> list[float]:
+    """Return the last value of each curve."""
+    return [curve[column][-1] for curve in curves]
 
 
 def worlds(rows: pd.DataFrame) -> Iterator[tuple[str, dict[str, pd.DataFrame]]]:
