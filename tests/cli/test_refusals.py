@@ -142,6 +142,7 @@ REFUSED = [
     ("build-scene no.osm -o new", "no.osm does not exist; give the path of a map"), ("build-scene malformed.osm -o new", "line 1.*malformed XML"),
     ("build-scene steel.xml -o new", r"kryptonite|\.ply"), ("build-scene preset:small -o m.csv", "m.csv is a file"),
     (f"{TOWN_IN} --frequency-hz -1", "frequency"), (f"{TOWN_IN} --bbox 1,2,3", "--bbox '1,2,3' is not 4 numbers"),
+    (f"{TOWN_IN} --bbox 2,0,1,3", "the south below the north"), (f"{TOWN_IN} --bbox 8,47,9,48", "seem to be swapped: --bbox is LAT_MIN,LON_MIN"),
     (f"{TOWN_IN} --height-default -3", "default height of -3 m"), (f"{TOWN_IN} --material brick=cheese", "no ITU material 'cheese'"),
     (f"{TOWN_IN} --material brick", "'brick' is not NAME=ITU"), (f"{TOWN_IN} --material-table none.toml", "none.toml does not exist"),
     (f"{TOWN_IN} --scale 2 --up y", "--scale, --up cannot be used with it"), (f"{TOWN_IN} --ground-column H", "--height-column, too"),

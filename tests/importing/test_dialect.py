@@ -59,6 +59,11 @@ def test_declared_lines_are_not_looked_for(read):
         read(text, lines_before_header=0, delimiter=";")
 
 
+def test_a_line_that_was_cut_off_is_told(read):
+    source, table = read(text_of(";") + "4;48.4;11.8")
+    assert table == ROWS and "1 line after the table" in source.notes[0]
+
+
 @pytest.mark.parametrize("rows", [300, 500, 30_000])
 def test_a_summary_is_found_however_long_the_table_is(read, rows):
     """Of which the beginning alone is looked at for all else; the last does not fit into one block."""

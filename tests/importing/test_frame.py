@@ -29,6 +29,14 @@ def test_north_is_the_arc_of_the_meridian(latitude):
     assert y_m == pytest.approx(arc_m, abs=1e-4) and x_m == pytest.approx(0, abs=1e-6)
 
 
+@pytest.mark.parametrize("latitude", [-33.9, 0.0, 48.1, 69.6])
+def test_east_is_the_circle_of_the_prime_vertical(latitude):
+    """Over a hundred metres the ellipsoid is the circle with the prime vertical's radius; x is east, not north."""
+    radius_m = A_M / np.sqrt(1 - E2 * np.sin(np.radians(latitude)) ** 2)
+    x_m, y_m, _ = local_positions(positions(latitude=latitude, longitude=-179.9995), origin(latitude, 179.9995))[0]
+    assert x_m == pytest.approx(radius_m * np.cos(np.radians(latitude)) * np.radians(0.001), abs=1e-4) and abs(y_m) < 2e-3
+
+
 def test_heights_are_kept_above_the_declared_ground():
     mixed = pd.concat([positions(latitude=48.2, longitude=11.5, altitude=540.0),
                        positions(latitude=48.1, longitude=11.5, height=7.0),

@@ -67,6 +67,17 @@ def test_endings_in_capitals(tmp_path, bring_all):
         assert list(table["flight"]) == ["ONE", "ONE", "TWO"] and list(table["device"]) == ["a", "a", "b"]
 
 
+def test_a_map_in_a_zip_file_is_read_where_it_is(tmp_path):
+    content = ('{"type": "FeatureCollection", "features": [{"type": "Feature", "properties": {"d": "a", "l": -80}, "geometry": '
+               '{"type": "Point", "coordinates": [11.5, 48.1]}}]}')
+    (tmp_path / "plain.geojson").write_text(content)
+    packed = zipped(tmp_path / "a.zip", {"points.geojson": content})
+    settings = read_settings(None, {"level_unit": "dBm", "columns": {
+        "device": "d", "level": "l", "latitude": "latitude", "longitude": "longitude"}})
+    for path, out in ((packed, tmp_path / "out"), (tmp_path / "plain.geojson", tmp_path / "same")):
+        assert import_files([path], settings, out)["origin"] == {"latitude_deg": 48.1, "longitude_deg": 11.5, "altitude_m": 0.0}
+
+
 def test_flights_and_receivers_by_file(logs, bring_all):
     table, _ = bring_all(logs, columns=MAPPING | {"flight": "by day", "receiver": "by file"})
     assert set(table["flight"]) == {"1970-01-01"} and set(table["receiver"]) == {"one", "two"}

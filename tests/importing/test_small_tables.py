@@ -75,6 +75,10 @@ CASES = {
         local(device_x="dx", device_y="dy", device_above_ground="dh", _devices="masts.csv"), {},
         {"x_m": [1, 2, 3], "y_m": [1, 2, 3], "z_m": [25, NAN, NAN], "above_ground_m": [NAN, 7, NAN]},
         files={"masts.csv": "device,x_m,y_m,z_m\na,0,0,25\nb,9,9,30\nc,1,1,\n"}),
+    "a height of the file holds for positions of a table": Case(
+        "who,d,l\nroof,a,-70\n", {"columns": {"receiver": "who", "device": "d", "level": "l", "height": "always 12"},
+                                  "length_unit": "m", "receivers": "fixed.csv"}, {"receiver_z_m": [12]},
+        files={"fixed.csv": "receiver,latitude,longitude\nroof,48,11\n"}),
     "altitudes of projected positions": Case(
         "x,y,a,d,l\n500000,5300000,530,a,-80\n", local(altitude="a", _crs="EPSG:32632", _origin={
             "latitude_deg": 47.8, "longitude_deg": 9, "altitude_m": 500}), {"receiver_z_m": [30]}),
@@ -187,6 +191,7 @@ CASES = {
     "impossible gains": Case(along(0, 80, -90), local(_level_unit="dB"), {"gain_db": [-90]}, left_out={"impossible level": 2}),
     "impossible milliwatts": Case(along(0, -5, 1e-9, 1), local(_level_unit="mW"), {"rssi_dbm": [-90]},
                                   left_out={"impossible level": 3}),
+    "an impossible level is one after the offset": Case(along(5, -20), local(_level_offset_db=-10.0), {"rssi_dbm": [-5, -30]}),
     "path losses": Case(along(120, 125.5, 139, 141), local(_level_unit=None, _path_loss=True, _level_offset_db=3.0),
                         {"gain_db": [-117, -122.5, -136, -138]}),
     "path losses above a threshold": Case(
@@ -228,6 +233,12 @@ CASES = {
     "a far gateway is no glitch": Case(
         "x,l,d,g\n" + "".join(f"{150_000 if i == 7 else i},{-80 - i % 9},a,{'far' if i == 7 else 'near'}\n" for i in range(40)),
         local(y="always 0", receiver="g"), left_out={}),
+    **{f"a walk north by 11 m in a second, and once at {place}": Case(
+        "t,lat,lon,l,d\n" + "".join(f"2024-05-01T10:00:{i:02}Z,{place if i == 20 else f'{48.1 + i * 1e-4},11.5'},{-80 - i % 9},a\n"
+                                    for i in range(40)),
+        {"time_format": "ISO 8601", "columns": {"time": "t", "latitude": "lat", "longitude": "lon", "level": "l", "device": "d"}},
+        {"rssi_dbm": [-80 - i % 9 for i in range(40) if i != 20 or not bad]}) for place, bad in (
+            ("-48.1,11.5", 1), ("4.81,11.5", 1), ("48.1,-150", 1), ("48.2,11.5", 1), ("48.104,11.5", 0), ("-677.7,11.5", 1))},
     "a place that a program writes without a fix": Case(
         "d,lat,lon,r,l,n\n" + "".join(f"{row},{i}\n" for i, row in enumerate(
             [f"a,48.10{i},11.50{i},phone,-8{i}" for i in range(5)] + ["a,37.751,-97.822,phone,-70"] * 20 + ["a,52.5,13.4,mast,-90"] * 20)),
@@ -316,7 +327,8 @@ REFUSED = [  # text, settings, words of the message, and tables
     (ONE, local(_devices="nowhere.csv"), "nowhere.csv does not exist"),
     ("x,y,d,l,la,lo\n0,0,a,-80,48,11\n", local(device_latitude="la", device_longitude="lo"), "some positions are latitude.*--origin"),
     (ONE, local(_crs="EPSG:1"), "EPSG:1.*is unknown.*such as EPSG:32633"), (ONE, local(_crs="EPSG:4326"), "not a projected one"),
-    (ONE, local(_crs="+init=/etc/passwd:1"), "is unknown.*AUTHORITY:CODE"),
+    *((ONE, local(_crs=crs), "is unknown.*AUTHORITY:CODE") for crs in (
+        "+init=/etc/passwd:1", "+proj=utm +zone=32 +ellps=bessel +nadgrids=/etc/passwd")),
     (lines("11,48"), local(_crs="EPSG:32632"), "x, y = 11, 48 is latitude 0.000, longitude 4.511, far outside"),
     (lines("5.3e6,5e5"), local(_crs="EPSG:32632"), "far outside of the area of 'EPSG:32632'.*swapped"),
     *((clock("2024-03-01 10:00", device="b"), local(time="t", y="always 0", _time_format="ISO 8601", _devices="sites.csv"), message,

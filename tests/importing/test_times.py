@@ -46,6 +46,10 @@ def test_the_offset_changes_within_a_file(texts):
     assert list(read(texts, "ISO 8601")) == [first, first + 7200]
 
 
+def test_winter_has_another_offset():
+    assert read(["2022-01-06 05:00:00"], "ISO 8601", "America/Denver")[0] == datetime(2022, 1, 6, 12, tzinfo=UTC).timestamp()
+
+
 def test_a_date_ends_in_no_offset():
     midnight = datetime(2024, 3, 31, tzinfo=UTC).timestamp()
     assert list(read(["2024-03-31", "20240331T01", "2024-03-31T020000"], "ISO 8601", "UTC") - midnight) == [0, 3600, 7200]

@@ -7,7 +7,7 @@ import pytest
 import shapely
 
 from radiotwin.errors import BadInput, RunFailed
-from radiotwin.io.budgets import CROSSINGS, OUTLINE_CORNERS, OVERLAPS, TOUCHING_CORNERS
+from radiotwin.io.budgets import CROSSINGS, OUTLINE_CORNERS, OVERLAPS, PART_PAIRS, TOUCHING_CORNERS
 from radiotwin.scene.materials import Names
 from radiotwin.scene.readers import build_scene_from_map, overpass
 from radiotwin.scene.readers.gis_files import _other_tags, read_geopackage
@@ -28,7 +28,8 @@ def circle(corners, step=1):
 @pytest.mark.parametrize(("budget", "limit", "rings", "message"), [
     (CROSSINGS, "1000", [circle(101, 50)], "feature 1: .* crossings .*RADIOTWIN_MAX_CROSSINGS"),
     (OUTLINE_CORNERS, "100", [box(300, 0), circle(101)], "feature 2: 102 corners; at most 100"),
-    (OVERLAPS, "100", [box(0, 0)] * 20, "pairs of buildings that overlap; at most 100")])
+    (OVERLAPS, "100", [box(0, 0)] * 20, "pairs of buildings that overlap; at most 100"),
+    (PART_PAIRS, "100", [box(0, 0)] * 20, "400 pairs of a building, part or roof and one around it; .* RADIOTWIN_MAX_PART_PAIRS")])
 def test_budgets(tmp_path, monkeypatch, budget, limit, rings, message):
     monkeypatch.setenv(budget.variable, limit)
     with pytest.raises(BadInput, match=message):

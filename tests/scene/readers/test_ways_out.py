@@ -64,3 +64,14 @@ def test_following_the_advice_helps(tmp_path, row, option):
     with pytest.raises(BadInput, match="--height-column NAME"):
         readers.build_scene(source, tmp_path / "out")
     assert readers.build_scene(source, tmp_path / "out", **option).folder
+
+
+def test_declaring_a_system_helps(tmp_path):
+    corners = [[691_000 + x, 5_336_000 + y] for x, y in ((0, 0), (20, 0), (20, 9), (0, 9), (0, 0))]
+    source = geojson(tmp_path, [])
+    source.write_text('{"type": "Feature", "properties": {"height": 9}, "geometry": {"type": "Polygon", '
+                      f'"coordinates": [{corners}]}}}}')
+    with pytest.raises(BadInput, match="no longitude and latitude in degrees.* declare it with --crs"):
+        readers.build_scene(source, tmp_path / "out")
+    report = readers.build_scene(source, tmp_path / "out", crs="EPSG:25832")
+    assert re.search(r"latitude_deg = 48\.1\d+\nlongitude_deg = 11\.5", (report.folder / "scene.toml").read_text())
