@@ -1,6 +1,8 @@
 """`radiotwin import` as a user runs it: the worked examples, round trips, and input that cannot be used."""
 
 import json
+import os
+import re
 import shlex
 from collections import Counter
 from pathlib import Path
@@ -84,6 +86,18 @@ def test_formulas_are_written_as_texts_and_read_as_they_were(run, tmp_path):
         assert "'=cmd" in (tmp_path / "out" / name).read_text() and "'-5" not in (tmp_path / "out" / name).read_text()
     back = read_measurements(tmp_path / "out" / "measurements.csv")
     assert list(back.table["device"]) == ["=cmd|' /C calc'!A0", "-5"], "and the repeated row was found"
+
+
+@pytest.mark.parametrize("options", [
+    "t.csv --columns pipe -o out", f"pipe.csv {LOCAL}", "t.csv --columns deep.toml -o out", f"t.csv {LOCAL} --devices pipe.csv"])
+def test_pipes_and_deep_nesting_are_one_message(run, tmp_path, options):
+    for name in ("pipe", "pipe.csv"):
+        os.mkfifo(tmp_path / name)
+    (tmp_path / "t.csv").write_text("d,x,y,l\na,0,0,-80\n")
+    (tmp_path / "deep.toml").write_text("a." * 20_000 + "b = 1")
+    done = run(f"import {options}", tmp_path)
+    assert done.returncode == 2 and re.search("not a regular file|RADIOTWIN_MAX_NESTING", " ".join(done.stderr.split())), done.stderr
+    assert len(done.stderr) < 4000 and not (tmp_path / "out").exists()
 
 
 def test_the_command_that_is_printed_repeats_the_import(run, tmp_path):

@@ -294,7 +294,9 @@ REFUSED = [  # text, settings, words of the message, and tables
     # Columns
     (ONE, local(level="rsrp"), r"column 'rsrp' \(level\) is missing; the file has x, y, d, l"),
     (ONE, local(time="{day} {minute}", device="{d}-{lac}"), r"columns 'lac' \(device\), 'day' \(time\), 'minute' \(time\) are missing"),
-    (ONE, local(x="d"), "row 2, column d: 'a' is not a number"),
+    (ONE, local(x="d"), "row 2, column d: 'a' is not a number"), (lines(f"{'9' * 6000},0"), local(), "column x: '9999.* is not a number"),
+    (ONE.replace("a,", "\x1b[2Ja,"), local(), r"column d: '\\x1b\[2Ja' is no name"),
+    ("x,y,d,l,h\n0,0,a,-80,1e300\n", local(heading="h"), "row 2, column h: '1e300' is out of range"),
     (lines("0,0", "east,0", "west,0"), local(), r"row 3, column x: 'east' is not a number \(2 such rows\)"),
     (lines("5,7"), local(_length_unit=None), "column x: length_unit is not given; allowed are m and ft.*5 to 5"),
     (ONE, local(z="always 1.5", _length_unit=None), "always 1.5: length_unit is not given"),
