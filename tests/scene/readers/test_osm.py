@@ -54,6 +54,14 @@ def relation(role, way_tags="", relation_tags='<tag k="type" v="multipolygon"/>'
             f'<relation id="1"><member type="way" ref="1" role="{role}"/>{relation_tags}</relation></osm>')
 
 
+def test_a_relation_without_its_ways_is_cut(tmp_path):
+    path = tmp_path / "a.osm"
+    path.write_text(relation("outer", relation_tags='<tag k="type" v="multipolygon"/><tag k="building" v="yes"/>'
+                             '<member type="way" ref="5" role="outer"/>'))
+    found = assemble(read_osm_xml(path))
+    assert not found.features and "lack nodes or ways" in found.left_out[0].reason
+
+
 def test_old_multipolygons_have_their_tags_at_the_outer_way(tmp_path):
     found = features(tmp_path, relation("outer", '<tag k="building" v="yes"/><tag k="height" v="7"/>'))
     assert list(found) == ["relation/1"] and found["relation/1"].tags["height"] == "7"
