@@ -27,6 +27,7 @@ from radiotwin.coverage.output import (
 from radiotwin.errors import BadInput
 from radiotwin.geo import to_geographic
 from radiotwin.report import write_coverage_pictures
+from radiotwin.report.labels import attribution
 from radiotwin.scene import Scene
 from tests.coverage.conftest import box, write_scene
 
@@ -162,3 +163,9 @@ def test_without_an_origin_there_is_no_globe_and_without_rasterio_no_raster(cove
     monkeypatch.setitem(__import__("sys").modules, "rasterio", None)
     formats, notes = available_formats(local, None)
     assert formats == ["nc", "png"] and all("rasterio" in note and "'radiotwin[gis]'" in note for note in notes[:2])
+
+
+def test_maps_of_openstreetmap_are_credited(scene):
+    assert attribution(scene) == ""
+    of_osm = scene.config.model_copy(update={"provenance": {"source": "data/town.osm.pbf"}})
+    assert attribution(Scene(scene.folder, of_osm)) == "© OpenStreetMap contributors (ODbL)"

@@ -76,7 +76,7 @@ def test_sinr_between_two_equal_transmitters_is_minus_the_load(build, twin_of, l
     assert power_at(coverage, -5, 0, "best_server") == 0 and power_at(coverage, 5, 0, "best_server") == 1
 
 
-@pytest.mark.parametrize(("apart_hz", "share"), [(0.0, 1.0), (5e6, 0.75), (60e6, 0.0)])
+@pytest.mark.parametrize(("apart_hz", "share"), [(0.0, 1.0), (5e6, 0.75), (20e6, 10**-4.5), (60e6, 0.0)])
 def test_of_overlapping_channels_the_common_part_interferes(build, apart_hz, share):
     """Free space by hand (ITU-R P.525) at a mast's line of sight, and the share of the two bands that overlaps."""
     scene = build()
@@ -100,6 +100,17 @@ def test_noise_follows_bandwidth_and_noise_figure(build, twin_of):
     assert wide.dataset.attrs["noise_dbm"] == pytest.approx(-95.0 + 10 * math.log10(4), abs=1e-6)
     own = predict_coverage(twin_of(devices), scene, settings=CoverageSettings(step_m=100.0, noise_figure_db=5.0))
     assert own.dataset.attrs["noise_dbm"] == pytest.approx(-173.98 + 70 + 5, abs=0.01)
+
+
+def test_share_of_a_polygon(build, twin_of):
+    """A strip of 100 m that the edge of a disc of 300 m cuts far from its middle."""
+    devices = [("a", 0.0, 0.0, 1.5)]
+    threshold_dbm = 30.0 + FREE_SPACE_AT_1_M_DB - 20 * math.log10(300.0)
+    strip = Area("strip", shapely.box(0.0, -50.0, 500.0, 50.0))
+    coverage = predict_coverage(twin_of(devices), build(devices=devices), areas=[strip],
+                                settings=CoverageSettings(step_m=2.0, threshold_dbm=threshold_dbm))
+    inside_m2 = strip.outline.intersection(shapely.Point(0, 0).buffer(300.0, quad_segs=100)).area
+    assert share_at(coverage, threshold_dbm, 1) == pytest.approx(inside_m2 / 50_000.0, rel=0.003)
 
 
 def test_cells_in_buildings_are_left_out_or_lose_the_entry_loss(build, twin_of, house):

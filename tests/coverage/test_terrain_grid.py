@@ -13,6 +13,12 @@ from tests.terrains import incline, terrain_map
 MAST = [Transmitter("a", np.array([-300.0, 0, 20]), 30.0)]
 
 
+def test_receivers_stand_on_the_slope():
+    height = incline(0.2, -0.1)
+    at_m = CoverageGrid.over((-100, 100, -50, 50), 10.0, 1.5).receivers_m(slice(None), terrain_map(height))
+    assert at_m[:, 2] == pytest.approx(height(at_m[:, 0], at_m[:, 1]) + 1.5, abs=0.01)
+
+
 def test_cells_of_a_map_above_the_ground_are_above_it():
     axis_m = np.arange(-50.0, 51, 10)
     height = incline(0.2, 0.0)

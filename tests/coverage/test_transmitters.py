@@ -42,6 +42,12 @@ def test_every_column_is_read(scene, tmp_path):
     assert with_powers([second], scene, None)[0].tx_power_dbm == 30.0  # the scene's
 
 
+def test_positions_on_the_globe(scene, tmp_path):
+    longitude, latitude = to_geographic(scene.config.origin, [100.0], [-50.0])
+    path = written(tmp_path, f"device,latitude_deg,longitude_deg,z_m\ns1,{latitude[0]:.9f},{longitude[0]:.9f},5\n")
+    np.testing.assert_allclose(read_transmitters(path, scene)[0].position_m, [100, -50, 5], atol=1e-3)
+
+
 def test_positions_of_another_frame(scene, tmp_path):
     other = Origin(latitude_deg=47.501, longitude_deg=8.7)
     write_frame(other, tmp_path / "frame.toml")

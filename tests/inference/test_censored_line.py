@@ -20,6 +20,13 @@ def parameters(line):
     return np.array([line.intercept_db, line.exponent, line.sd_db])
 
 
+def test_without_censoring_it_is_least_squares():
+    x, y = draw(0)
+    slope, intercept = np.polyfit(x, y, 1)
+    expected = [intercept, -slope / 10.0, np.std(y - intercept - slope * x)]
+    assert parameters(fit_line(x, y, None)) == pytest.approx(expected, abs=2e-3)
+
+
 def test_with_half_of_the_levels_blank_the_law_is_found_within_4_standard_errors():
     censored, ignored, share = [], [], []
     for seed in range(30):

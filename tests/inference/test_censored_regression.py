@@ -190,3 +190,15 @@ def test_what_is_read_near_a_floor_is_the_mean_of_what_may_arrive(random_effect_
     np.testing.assert_allclose(expected.mean_db, drawn_db.mean(axis=0), atol=0.15)
     assert (np.diff(expected.scale_db) > 0).all() and 3.5 <= expected.scale_db[0] < 4
     assert expected.scale_db[-1] == pytest.approx(np.hypot(7.0, random_effect_sd_db), rel=0.05)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_law_under_a_floor_is_found(seed):
+    """Three links in four lie below the floor of the receiver; a law without it would be half as steep."""
+    rng = np.random.default_rng(seed)
+    columns = np.column_stack([np.ones(4000), rng.uniform(1.5, 3.5, 4000)])
+    arriving_db = columns @ [-20.0, -32.0] + 6.0 * rng.standard_t(5, 4000)
+    level_db = floored(arriving_db, -85.0)[0] + rng.normal(0, 1.0, 4000)
+    given = problem(level_db, columns, receiver=lambda level: floored(level, -85.0))
+    assert fit(given).coefficients[1] == pytest.approx(-32.0, abs=4.0)
+    assert fit(replace(given, receiver=None)).coefficients[1] > -22

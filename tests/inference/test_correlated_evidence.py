@@ -102,3 +102,15 @@ def test_long_series_are_thinned_and_cut_into_parts_and_blank_rows_are_left_out(
     assert np.sum(extent_m) < 1.05 * 300.0**3  # parts are boxes beside each other
     nothing = CorrelatedEvidence.fit(np.zeros(240, dtype=int), np.zeros((240, 3)), np.full(240, np.nan), NOTHING, 0)
     assert nothing.log_evidence(np.zeros(240), NOTHING) == 0.0
+
+
+def test_a_series_in_parts_is_worth_nearly_what_it_is_in_one(monkeypatch):
+    found = []
+    for most in (400, 40):
+        monkeypatch.setattr(correlated_evidence, "MAX_POINTS", most)
+        rng = np.random.default_rng(3)
+        label, position_m, z = field(rng, 1.0, 20.0)
+        pattern = rng.normal(size=(240, 1))
+        z += 0.5 * pattern[:, 0]
+        found.append(gain_nats(CorrelatedEvidence.fit(label, position_m, z, NOTHING, 0), z, pattern, 1.0))
+    assert found[0] > 5 and found[1] == pytest.approx(found[0], rel=0.2)

@@ -157,6 +157,15 @@ def test_a_sample_is_drawn_by_the_seed_without_repetition(links, small_sample):
     assert not np.array_equal(first, other)
 
 
+def test_no_position_in_time_is_preferred(links, small_sample):
+    """Rationale: every k-th link would always be of the same part of a regular flight."""
+    numbered = links.with_columns(quality=np.arange(float(len(links))))
+    drawn = np.concatenate([thin_links(numbered, seed).quality for seed in range(200)]).astype(int)
+    often = np.bincount(drawn, minlength=len(links)) / 200
+    assert often.mean() == pytest.approx(500 / len(links))
+    assert np.abs(often - often.mean()).max() < 0.25 and often.min() > 0
+
+
 @pytest.mark.seconds
 @pytest.mark.usefixtures("short_report")
 def test_the_report_says_so_and_finds_what_all_links_show(open_ground, small_sample):

@@ -136,6 +136,14 @@ def test_bad_devices(write, devices, message):
         read_measurements(write(HEADER + ROWS, devices))
 
 
+def test_a_parquet_file_with_one_name_twice(write, tmp_path):
+    pyarrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    write(HEADER + ROWS)
+    parquet.write_table(pyarrow.table([[1.0], [2.0]], names=["gain_db", "gain_db"]), tmp_path / "m.parquet")
+    with pytest.raises(BadInput, match="column 'gain_db' occurs twice"):
+        read_measurements(tmp_path / "m.parquet")
+
+
 def test_files_that_are_not_tables_and_tables_that_need_others(tmp_path, write, monkeypatch):
     path = write(HEADER + ROWS)
     with pytest.raises(BadInput, match="does not exist"):

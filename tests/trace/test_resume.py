@@ -89,6 +89,17 @@ def test_gain_does_not_depend_on_the_other_links(small_scene):
     assert np.nanquantile(np.abs(shuffled[0] - alone[0, order]), 0.99) < 0.5
 
 
+def test_link_is_the_same_both_ways(small_scene):
+    """Rays start at one end only, so the two ways find the same paths but for what sampling misses."""
+    settings = SolverSettings(samples_per_src=30_000, batch_receivers=20, max_num_paths_per_src=50_000)
+    points_m = small_scene.lattice.positions_m[7::64][:8]
+    there = trace_gains(small_scene, small_scene.device_m[:1], points_m, settings)[0]
+    back = trace_gains(small_scene, points_m, small_scene.device_m[:1], settings)[:, 0]
+    both = np.isfinite(there) & np.isfinite(back)
+    assert both.sum() >= 6
+    assert np.median(np.abs(there - back)[both]) < 0.5
+
+
 def test_concrete_below_one_gigahertz_is_traced_with_a_warning(own_scene, caplog):
     radio = own_scene.config.radio.model_copy(update={"frequency_hz": 700e6})
     write_config(own_scene.config.model_copy(update={"radio": radio}), own_scene.folder / "scene.toml")

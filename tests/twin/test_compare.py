@@ -118,6 +118,25 @@ def test_twins_are_matched_by_the_names_of_their_devices(comparison, small_scene
     np.testing.assert_allclose(by_model["twin"], by_model["turned"])
 
 
+def test_received_power_is_compared_with_a_map_of_gain(small_scene, truth, flown):
+    """20 dBm transmitted: levels 20 dB above the gain, errors the same."""
+    radio = small_scene.config.radio
+    radio = radio.model_copy(update={"tx_power_dbm": 20.0, "sensitivity_dbm": radio.sensitivity_dbm + 20.0 - radio.tx_power_dbm})
+    loud = Scene(small_scene.folder, small_scene.config.model_copy(update={"radio": radio}))
+    truth = dataclasses.replace(truth, dataset=truth.dataset.assign_attrs(scene_hash=loud.content_hash()))
+    table = flown.table.assign(rssi_dbm=flown.table["gain_db"] + 20.0).drop(columns="gain_db")
+    gains, powers = (compare_models(*split_flights(measured, 1), loud, truth, seed=0, models=("segmented_log_distance",))
+                     .scores["bias_db"].to_numpy() for measured in (flown, Measurements(table, flown.devices)))
+    np.testing.assert_allclose(gains, powers, atol=0.05)
+    assert np.abs(gains).max() < 2
+
+
+def test_a_truth_of_another_scene_is_refused(small_scene, truth, flown):
+    stale = dataclasses.replace(truth, dataset=truth.dataset.assign_attrs(scene_hash="0" * 64))
+    with pytest.raises(BadInput, match="radiotwin trace"):
+        compare_models(*split_flights(flown, 1), small_scene, stale, seed=0)
+
+
 def test_nothing_detected_on_the_held_out_flight(small_scene, truth, flown):
     train, test = split_flights(flown, 1)
     silent = Measurements(test.table.assign(gain_db=np.nan), test.devices)

@@ -26,6 +26,11 @@ def test_copies_of_links_are_left_out(small_scene, flown):
     assert again.devices == fit_twin(flown, small_scene, model="log_distance", seed=0).devices
 
 
+def test_anchors_keep_their_positions(flown, twin):
+    anchors = [(each, tuple(at_m)) for each, at_m in zip(twin.devices, flown.device_m) if each.role == "anchor"]
+    assert anchors and all((each.x_m, each.y_m, each.z_m) == at_m and each.credible_radius_m == 0 for each, at_m in anchors)
+
+
 def test_a_device_never_measured_is_reported_not_guessed(small_scene, flown, tmp_path):
     heard = (flown.table["device"] != "d3").to_numpy()
     twin = fit_twin(flown.select(heard), small_scene, model="segmented_log_distance", seed=0)
@@ -80,6 +85,15 @@ def test_a_twin_of_another_scene_is_warned_of(small_scene, flown, twin):
         twin.radio_map(other)
     with pytest.warns(UserWarning, match="another scene"):
         fit_twin(flown, other, model="log_distance", seed=0, start=twin)
+
+
+def test_blanks_far_above_the_limit_of_detection_are_warned_of(small_scene, flown):
+    level_db = flown.table["gain_db"]
+    table = flown.table.assign(gain_db=level_db.mask(level_db < np.nanquantile(level_db, 0.2)))
+    radio = small_scene.config.radio.model_copy(update={"sensitivity_dbm": -150.0})
+    deaf = Scene(small_scene.folder, small_scene.config.model_copy(update={"radio": radio}))
+    with pytest.warns(UserWarning, match="-150 dB .*, is not used: but for odd ones, the weakest of"):
+        fit_twin(Measurements(table, flown.devices), deaf, model="log_distance", seed=0)
 
 
 def test_of_too_many_links_some_of_each_device_are_drawn(monkeypatch):

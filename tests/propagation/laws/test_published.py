@@ -230,6 +230,13 @@ def test_each_branch_has_the_range_that_it_was_published_for(law, links, expecte
     assert law.inside(links).tolist() == [not expected]
 
 
+@pytest.mark.parametrize("law", [UrbanMacro, UrbanMicro])
+def test_above_the_published_heights_the_highest_of_them_holds(law):
+    for los in (True, False):
+        found = [law(2.4e9, True).predict(link(high_m, distance_m=1000.0, los=los))[0][0] for high_m in (300.0, 450.0)]
+        assert found[0] == found[1]
+
+
 def test_what_is_outside_is_named_once_each():
     law = WalfischIkegami(2.4e9, True, roof_m=15.0)
     two = [link(60.0, 1.5, distance_m=400.0), link(70.0, 1.5, distance_m=400.0)]

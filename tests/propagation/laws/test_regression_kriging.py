@@ -53,6 +53,20 @@ def test_far_away_and_for_an_unmeasured_device_it_is_the_law(world):
     assert (model.predict(near)[1] < model.law.predict(near)[1]).all()
 
 
+def test_pure_noise_leaves_the_law_nearly_alone(world):
+    train, test = world(5, 900), world(6, 3000)
+    model = RegressionKriging().fit(train.links, train.level_db, None, seed=0)
+    difference_db = model.predict(test.links)[0] - model.law.predict(test.links)[0]
+    assert np.sqrt(np.mean(difference_db**2)) < 0.6
+
+
+def test_batches_do_not_show(world):
+    train, many = world(8, 300), world(9, 15_000).links
+    model = RegressionKriging().fit(train.links, train.level_db + shadowing(train.links), None, seed=0)
+    parts = [model.predict(many.select(slice(i, i + 3777))) for i in range(0, 15_000, 3777)]
+    np.testing.assert_allclose(np.concatenate(parts, axis=1), np.array(model.predict(many)), atol=1e-9)
+
+
 def test_a_shadow_that_was_not_detected_stays_dark(world):
     """A disc of 80 m in which nothing arrives: predicted below the law there, and lower than if left out."""
     train = world(7, 2400)

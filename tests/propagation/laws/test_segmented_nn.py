@@ -48,6 +48,14 @@ def test_learns_a_break_point_that_no_line_has(world, laws):
         assert error[1] < 0.5 * error[0]
 
 
+def test_nine_in_ten_fall_within_their_interval(fitted_nn, world):
+    fresh = world(31, 20_000)
+    mean_db, sd_db = fitted_nn[0].predict(fresh.links)
+    within = np.abs(fresh.level_db - mean_db) < 1.645 * sd_db
+    for los in (True, False):
+        assert within[fresh.links.los == los].mean() == pytest.approx(0.9, abs=0.03)
+
+
 def test_equal_seeds_give_equal_bits_whatever_the_threads(world):
     data = world(40, 80)
     before, models = torch.get_num_threads(), []

@@ -150,6 +150,17 @@ def test_a_tenth_of_the_rays_finds_nearly_all_power(town, links, there):
     assert np.quantile(lacking_db, 0.9) < 0.1 and lacking_db.max() < 3.0
 
 
+def test_subdivided_walls_change_nothing(box_mesh, city_of, links):
+    mesh = trimesh.util.concatenate([box_mesh(20, 5, 60, 30, 25), box_mesh(15, -40, 55, -12, 30)])
+    whole, cut = (stacked(powers_of_links(city_of(each), *links)) for each in (mesh, mesh.subdivide().subdivide()))
+    assert np.allclose(whole, cut, rtol=1e-6, atol=1e-16)
+
+
+def test_more_interactions_only_add(town, links, there):
+    totals = [powers_of_links(town(), *links, depth=depth).total for depth in (1, 2)] + [there.total]
+    assert (totals[0] <= totals[1] * (1 + 1e-9)).all() and (totals[1] <= totals[2] * (1 + 1e-9)).all()
+
+
 def test_solids_that_touch_are_as_one(box_mesh, city_of):
     """An edge inside a shared wall, such as that of the lower roof, carries no power."""
     parts = [box_mesh(0, 0, 20, 30, 20), box_mesh(20, 5, 40, 25, 12)]

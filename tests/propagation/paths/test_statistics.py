@@ -34,6 +34,12 @@ def test_angular_spread_does_not_depend_on_where_north_is(turned_rad):
     assert spread == pytest.approx([np.degrees(np.sqrt(-2 * np.log(resultant))), 0, np.nan], abs=1e-5, nan_ok=True)
 
 
+def test_paths_a_whole_number_of_taps_apart_keep_their_amplitudes():
+    response, = impulse_response(np.array([0.5j, -0.2]), np.array([0, 1e-6]), np.array([0, 0]), 1, 10e6, 2 * EDGE_TAPS + 11)
+    assert np.flatnonzero(np.abs(response) > 1e-12).tolist() == [EDGE_TAPS, EDGE_TAPS + 10]
+    assert response[[EDGE_TAPS, EDGE_TAPS + 10]] == pytest.approx([0.5j, -0.2])
+
+
 def test_energy_of_a_response_is_that_of_its_paths_and_the_sum_of_taps_their_field():
     """Parseval: taps of all times hold the sum of a_i conj(a_j) sinc(B (t_i - t_j))."""
     rng = np.random.default_rng(1)

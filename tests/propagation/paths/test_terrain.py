@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import trimesh
 
 from radiotwin.propagation.paths.listing import NO_INTERACTION, TERRAIN, follow_rays
 from radiotwin.propagation.paths.powers import path_powers
@@ -53,6 +54,13 @@ def test_over_a_crest_as_over_a_knife_edge():
         loss_db = knife_edge_db(65 - (12 + z_m) / 2, 150, 150)
         assert got["direct"] == 0
         assert 10 * np.log10(got["diffracted"] / friis(np.hypot(300, z_m - 12))) == pytest.approx(-loss_db, abs=4)
+
+
+def test_a_wall_behind_a_ridge_does_not_reflect():
+    wall = trimesh.creation.box(bounds=[[100, -150, 5], [110, 150, 40]])
+    hidden, seen = (one_link(terrain_map(ridge(crest_m), half_m=300.0, building=wall), [-120, -30, 30], [-120, 30, 30],
+                             depth=1)["reflected_1"] for crest_m in (60.0, 0.0))
+    assert hidden == 0 < seen
 
 
 def test_behind_a_rounded_hill_one_path_goes_along_it():

@@ -58,6 +58,10 @@ def test_a_peak_narrower_than_a_cell_counts_once_a_swarm_has_found_it():
     assert np.linalg.norm(found.modes(everywhere)[0][0] - (33.3, 71.7)) < 0.2
 
 
+def test_the_region_of_a_flat_posterior_is_nine_tenths():
+    assert np.isclose(posterior_of(lambda xy_m: np.zeros(len(xy_m))).region_share(), 0.9, atol=0.01)
+
+
 def test_mean_of_a_crescent_is_on_it():
     def ring(xy_m):
         return -0.5 * ((np.linalg.norm(xy_m - (100, 100), axis=1) - 60) / 3) ** 2
