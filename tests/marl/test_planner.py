@@ -20,6 +20,7 @@ from marl.planner import (
     expected_flight,
     plan,
 )
+from tests.marl.exhaustive import most_data, small_mission
 
 
 def flown(mission, actions, flights=1, seed=0):
@@ -113,6 +114,12 @@ def test_it_finds_the_best_flight_where_all_can_be_tried(tiny, slow, seed):
 def test_two_uavs_share_the_work_as_well_as_can_be(corners):
     mission, optimum = corners
     assert 0.98 * optimum <= plan(mission, 20_000, 0).ratio <= optimum * (1 + 1e-6)
+
+
+@pytest.mark.parametrize("seed", [0, 2, 3, 15, 16, 17])
+def test_two_uavs_come_within_two_percent_of_the_best_of_all_pairs_of_flights(seed):
+    mission = small_mission(seed)
+    assert 0.98 <= plan(mission, 20_000, 0).ratio / most_data(mission) <= 1 + 1e-6
 
 
 def test_the_same_seed_gives_the_same_plan_and_more_search_none_worse(city_mission):
