@@ -138,9 +138,9 @@ def test_a_search_that_goes_on_from_the_slot_that_changes_counts_as_a_flight_fro
     search = Search.of(mission, candidates, nothing, np.zeros(mission.uavs, np.int64))
     for _ in range(5):
         _anneal(mission, candidates, search, -1, 1.0, np.zeros(8), rng)
-        flight = expected_flight(mission, value, search.tour, search.count)
+        flight = expected_flight(mission, value, search.tour, search.visits)
         assert search.share[0] == pytest.approx(1 - flight.left[-1].sum() / mission.data_units.sum(), abs=1e-12)
-        course, again = search.course, Search.of(mission, candidates, search.tour, search.count).course
+        course, again = search.course, Search.of(mission, candidates, search.tour, search.visits).course
         flown = again.device >= 0
         np.testing.assert_array_equal(course.before[flown], again.before[flown])
         for name in ("place", "since", "device", "left"):
