@@ -99,5 +99,6 @@ def _middle(source: str) -> tuple[float, float, float, float]:
     west, east, south, north = x_m - half_x_m, x_m + half_x_m, y_m - half_y_m, y_m + half_y_m
     if origin is None:
         return west, south, east, north
-    (west, east), (south, north) = to_geographic(origin, [west, east], [south, north])
+    longitude_deg, latitude_deg = to_geographic(origin, [west, east], [south, north])
+    (west, east), (south, north) = longitude_deg.tolist(), latitude_deg.tolist()
     return south, west, north, east

@@ -55,3 +55,4 @@ def test_a_map_gives_the_square_in_its_middle_in_degrees(monkeypatch):
     across = np.radians([north - south, (east - west) * np.cos(np.radians(south))]) * 6_371_000
     assert across == pytest.approx([120, 120], rel=0.005)
     assert 47.0505 < south < north < 47.0533 and 8.3007 < west < east < 8.3048, "the town's"
+    assert {type(each) for each in (south, west, north, east)} == {float}, "they are written to scene.toml"
