@@ -84,12 +84,6 @@ class _GainDrift(GainEffect):
         super().__init__()
         self._between_flights = between_flights
 
-    @property
-    def _forms(self) -> tuple[str, ...]:
-        # A warm-up on each flight is no difference between flights.
-        excluded = "warm_up_each_flight" if self._between_flights else None
-        return tuple(form for form in self.forms if form != excluded)
-
     def index(self, links: Links) -> np.ndarray:
         """Return the index (n,) of each link's receiver, or device."""
         return getattr(links, self.end)
@@ -118,7 +112,8 @@ class _GainDrift(GainEffect):
         """Return why no drift can be searched (no times, or flights have no order); else None."""
         if np.isfinite(links.time_s).sum() < MIN_LINKS:
             return "there is no time_s"
-        if links.time_restarts and "warm_up_each_flight" not in self._forms:
+        if links.time_restarts and (self._between_flights
+                                    or "warm_up_each_flight" not in self.forms):
             return "time_s begins anew in each flight, so that flights have no order"
         return None
 
@@ -143,8 +138,9 @@ class _GainDrift(GainEffect):
             nats, form, number = max(
                 candidate for candidate in _candidates(
                     links.select(rows), view.residual_db[rows], view.weight[rows],
-                    self._between_flights) if candidate[1] in self._forms)
-            if nats > MIN_NATS:
+                    self._between_flights) if candidate[1] in self.forms)
+            # What fits best as a warm-up on each flight is no change between flights.
+            if nats > MIN_NATS and not (self._between_flights and form == "warm_up_each_flight"):
                 # The drift must not depend on the times of the links that it is applied to.
                 keep = form == "ageing" or not self.of_receiver
                 span_s = (links.first_s, links.last_s) if keep else None
