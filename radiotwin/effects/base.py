@@ -20,7 +20,7 @@ from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Protocol, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self
 
 import numpy as np
 
@@ -100,20 +100,6 @@ class Term:
 # How a term gets the channel's levels: by the quick law, from paths followed before, or by
 # following paths again.
 Levels = Literal["quick", "known_paths", "exact"]
-
-
-class Change(NamedTuple):
-    """A change of one receiver or device at one time.
-
-    Attributes:
-        end: (n,) index of the receiver, or of the device, of each link.
-        member: index of the one that changed.
-        when_s: time of the change [s].
-    """
-
-    end: np.ndarray
-    member: int
-    when_s: float
 
 
 class Effect(ABC):
@@ -292,10 +278,6 @@ class Effect(ABC):
 
         Such a change is searched separately, as held-out flights cannot show it.
         """
-        return None
-
-    def change(self, links: Links) -> Change | None:
-        """Return which device or receiver changed, and when; None if nothing changes in time."""
         return None
 
     def reading_offsets_db(self, coefficients: np.ndarray) -> dict[int, float]:

@@ -114,7 +114,7 @@ class CorrelatedEvidence:
         return self.of_rotated(self.rotated(z), self.rotated(columns.values), columns.prior_sd)[0]
 
     def coefficients(self, z: np.ndarray, columns: Columns) -> tuple[np.ndarray, np.ndarray]:
-        """Compute posterior mean (q,) and standard deviation (q,) of the columns' coefficients.
+        """Compute posterior mean (q,) and covariance (q, q) of the columns' coefficients.
 
         Noise and field variances are fitted to the residuals z (n,).
         """
@@ -122,7 +122,7 @@ class CorrelatedEvidence:
         theta = self.of_rotated(rotated, values, columns.prior_sd)[1]
         weighted = values.T / (np.exp(theta[0]) * (1.0 + np.exp(theta[1]) * self.spectrum))
         covariance = np.linalg.inv(weighted @ values + np.diag(1.0 / np.square(columns.prior_sd)))
-        return covariance @ (weighted @ rotated), np.sqrt(np.diag(covariance))
+        return covariance @ (weighted @ rotated), covariance
 
     def of_rotated(self, z: np.ndarray, columns: np.ndarray, prior_sd: np.ndarray,
                    start: np.ndarray = START) -> tuple[float, np.ndarray]:

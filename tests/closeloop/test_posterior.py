@@ -52,6 +52,52 @@ def test_no_further_cause_is_no_evidence_wherever_the_variances_are(open_ground)
         assert abs(scaled.gain_nats(scaled.base_z, nothing)) < 0.2
 
 
+def sd_of_levels_db(hypotheses):
+    """Return the tolerances of five devices, two receivers and twelve tracks, which are the last columns."""
+    devices, receivers, tracks = np.split(hypotheses.nuisance.prior_sd[-19:], [5, 7])
+    return devices[0], receivers[0], tracks[0]
+
+
+def scattered(label, sd_db, rng):
+    """Each end of a kind is off by a number of its own."""
+    return rng.normal(0, sd_db, label.max() + 1)[label]
+
+
+def test_the_scatter_of_flights_is_learnt_and_what_all_share_is_none(open_ground):
+    found_db = []
+    for seed in range(3):
+        def flights_differ(world, rng=np.random.default_rng(seed)):
+            world.gain_db += 10.0 + scattered(2 * world.flight + world.receiver, 2.0, rng)
+
+        found_db.append(sd_of_levels_db(looked_at(open_ground, seed, flights_differ)[1]))
+    devices_db, _, tracks_db = np.sqrt(np.mean(np.square(found_db), axis=0))
+    assert 1.2 < tracks_db < 2.8 and devices_db < 0.6
+
+
+def test_the_scatter_of_devices_is_learnt(open_ground):
+    found_db = []
+    for seed in range(3):
+        def devices_differ(world, rng=np.random.default_rng(seed)):
+            world.gain_db += scattered(world.device, 3.0, rng)
+
+        found_db.append(sd_of_levels_db(looked_at(open_ground, seed, devices_differ)[1]))
+    devices_db, _, tracks_db = np.sqrt(np.mean(np.square(found_db), axis=0))
+    assert 1.2 < devices_db < 4.0 and tracks_db < 0.6
+
+
+@pytest.mark.parametrize("fault", [
+    lambda world: 8.0 * (world.flight == 3), lambda world: 8.0 * (world.receiver == 1),
+    lambda world: 8.0 * ((world.receiver == 1) & (world.flight > 2)), lambda world: 8.0 * (world.device == 2),
+    lambda world: 1.5 * world.flight * (world.receiver == 0)],
+    ids=["a flight", "a receiver", "a step", "a device", "ageing"])
+def test_a_single_fault_does_not_widen_the_tolerance(open_ground, fault):
+    def faulty(world):
+        world.gain_db += fault(world)
+
+    devices_db, _, tracks_db = sd_of_levels_db(looked_at(open_ground, 2, faulty)[1])
+    assert devices_db < 0.7 and tracks_db < 0.7
+
+
 def late(world):
     """Write the levels of receiver 1 beside the positions of three seconds before."""
     mine = np.flatnonzero((world.receiver == 1) & (world.slot >= 3))

@@ -25,7 +25,7 @@ from radiotwin.effects.arrays import curve_columns, one_hot
 from radiotwin.effects.base import Effect
 from radiotwin.effects.params import NEAR_SHARE
 from radiotwin.inference.correlated_evidence import Columns, CorrelatedEvidence
-from radiotwin.inference.gaussian import MAD_SD, robust_sd
+from radiotwin.inference.gaussian import MAD_SD
 from radiotwin.links import Links
 from radiotwin.twin.model.correlated_shadowing import receivers_move
 from radiotwin.twin.model.model import Fit
@@ -313,7 +313,52 @@ def _clip_outliers(z: np.ndarray, near: np.ndarray) -> np.ndarray:
     return median + np.clip(z - median, -MAX_Z * scale, MAX_Z * scale)
 
 
-def _nuisance(links: Links, mean_db: np.ndarray) -> tuple[Columns, list[slice]]:
+@dataclass(frozen=True, eq=False)
+class _Family:
+    """Levels of k ends of one kind: devices, receivers, or tracks.
+
+    Attributes:
+        columns: their columns in the nuisance.
+        group: (k,) receiver of a track, about whose level its tracks scatter; else 0.
+        start_s: (k,) time at which a track begins [s]; NaN for other ends, or if unknown.
+    """
+
+    columns: slice
+    group: np.ndarray
+    start_s: np.ndarray
+
+    @property
+    def freedom(self) -> int:
+        """Degrees of freedom of the spread, one fewer than of deviations from the groups' means."""
+        return max(len(self.group) - len(np.unique(self.group)) - 1, 0)
+
+    def usual_variance(self, level_db: np.ndarray, covariance: np.ndarray) -> float:
+        """Estimate the variance of the good ends' levels [dB²] from their levels (k,).
+
+        The smaller one of two robust estimates counts: from deviations from the group's median,
+        which a faulty flight does not widen, and from differences of successive tracks, which a
+        drift or a step does not (von Neumann 1941, 'Distribution of the ratio of the mean square
+        successive difference to the variance', Ann. Math. Stat. 12). The error of the estimates,
+        from the levels' `covariance` (k, k), is subtracted; what all levels of a group share, and
+        no link determines, cancels.
+        """
+        if not self.freedom:
+            return 0.0
+        same = self.group[:, None] == self.group
+        ratio = len(same) / (self.freedom + 1)  # variance of levels over that of deviations
+        centred = np.eye(len(same)) - same / same.sum(axis=1)
+        medians = np.array([np.median(level_db[each]) for each in same])
+        found = [ratio * ((MAD_SD * np.median(np.abs(level_db - medians))) ** 2
+                          - np.median(np.diag(centred @ covariance @ centred.T)))]
+        order = np.lexsort((self.start_s, self.group))
+        steps = np.diff(np.eye(len(same))[order], axis=0)[np.diff(self.group[order]) == 0]
+        if np.isfinite(self.start_s).all():
+            found.append(0.5 * ((MAD_SD * np.median(np.abs(steps @ level_db))) ** 2
+                                - np.median(np.diag(steps @ covariance @ steps.T))))
+        return max(float(min(found)), 0.0)
+
+
+def _nuisance(links: Links, mean_db: np.ndarray) -> tuple[Columns, list[_Family]]:
     """Return design columns of usual errors of a base, which every hypothesis contains [dB].
 
     They are a level and a distance slope of LoS and of NLoS links, a curve over elevation and over
@@ -321,7 +366,7 @@ def _nuisance(links: Links, mean_db: np.ndarray) -> tuple[Columns, list[slice]]:
     each device, receiver and track (flight of a receiver).
 
     Returns:
-        the columns with prior sds, and the slice of columns of each of the last three kinds.
+        the columns with prior sds, and the families of columns of the last three kinds.
     """
     slope = np.log10(links.distance_m / 100.0)
     blocks, prior_sd_db, families = [], [], []
@@ -333,31 +378,36 @@ def _nuisance(links: Links, mean_db: np.ndarray) -> tuple[Columns, list[slice]]:
         blocks.append(curve_columns(values, CURVE_KNOTS, circular=False))
         prior_sd_db += [NUISANCE_SD_DB] * blocks[-1].shape[1]
     for label in (links.device, links.receiver, links.track):
-        members = np.unique(label)
+        members, first = np.unique(label, return_index=True)
         if 1 < len(members) <= MAX_ENDS:
             blocks.append(one_hot(label, members.tolist()))
-            families.append(slice(len(prior_sd_db), len(prior_sd_db) + len(members)))
+            columns = slice(len(prior_sd_db), len(prior_sd_db) + len(members))
+            is_track = label is links.track
+            families.append(_Family(columns,
+                                    links.receiver[first] if is_track else np.zeros(len(members)),
+                                    links.time_s[first] if is_track and not links.time_restarts
+                                    else np.full(len(members), np.nan)))
             prior_sd_db += [SPREAD_DB] * len(members)
     return Columns(np.hstack(blocks), np.array(prior_sd_db)), families
 
 
 def _with_estimated_tolerances(evidence: CorrelatedEvidence, z: np.ndarray, nuisance: Columns,
-                               families: list[slice]) -> Columns:
+                               families: list[_Family]) -> Columns:
     """Set the prior sd of the levels of devices, receivers and tracks to their estimated tolerance.
 
-    The levels of one kind (one of `families`) are estimated with a wide prior. If fewer than half
-    are faulty, their robust spread is the tolerance of the good ones. It is shrunk to `SPREAD_DB`,
-    fully so for two of a kind.
+    The levels of one kind are estimated with a wide prior. If fewer than half are faulty, their
+    robust spread is the tolerance of the good ones. It is shrunk to `SPREAD_DB`, fully so for two
+    of a kind.
     """
     for family in families:
         prior_sd = nuisance.prior_sd.copy()
-        prior_sd[family] = LEVEL_SD_DB
-        level_db, error_db = evidence.coefficients(z, Columns(nuisance.values, prior_sd))
-        level_db, error_db = level_db[family], error_db[family]
-        freedom = len(level_db) - 2
-        usual = robust_sd(level_db) ** 2 - float(np.median(error_db)) ** 2
-        spread = (SPREAD_ENDS * SPREAD_DB**2 + freedom * max(usual, 0.0)) / (SPREAD_ENDS + freedom)
-        prior_sd[family] = np.sqrt(spread)
+        prior_sd[family.columns] = LEVEL_SD_DB
+        level_db, covariance = evidence.coefficients(z, Columns(nuisance.values, prior_sd))
+        usual = family.usual_variance(level_db[family.columns],
+                                      covariance[family.columns, family.columns])
+        spread = ((SPREAD_ENDS * SPREAD_DB**2 + family.freedom * usual)
+                  / (SPREAD_ENDS + family.freedom))
+        prior_sd[family.columns] = np.sqrt(spread)
         nuisance = replace(nuisance, prior_sd=prior_sd)
     return nuisance
 

@@ -14,7 +14,7 @@ from pydantic import AfterValidator, Field
 from typing_extensions import override
 
 from radiotwin.effects.arrays import frequent_labels
-from radiotwin.effects.base import Change, Effect, GainEffect, LevelAt, ResidualView, Term
+from radiotwin.effects.base import Effect, GainEffect, LevelAt, ResidualView, Term
 from radiotwin.effects.params import (
     Allowed,
     DeviceIndex,
@@ -95,13 +95,6 @@ class _GainDrift(GainEffect):
     @override
     def between_flights(self) -> Effect:
         return type(self)(between_flights=True)
-
-    @override
-    def change(self, links: Links) -> Change:
-        member, drift = next(iter(self.drifts().items()))
-        # A warm-up counts as a change at its time constant, when two thirds of it are over.
-        when_s = drift.number + (links.first_s if drift.form == "warm_up" else 0.0)
-        return Change(self.index(links), member, when_s)
 
     def _members(self, links: Links) -> list[int]:
         """List the receivers, or devices, with enough links."""
