@@ -67,8 +67,7 @@ def in_scene_frame(measurements: Measurements, scene: Scene | Path | str,
                            "from the frame of the measurements to the scene's")
         offset_m = np.array([*shift_m, 0.0])
         measurements = measurements.moved(lambda position_m: position_m + offset_m, scene_origin)
-    measurements = measurements.on_ground(
-        scene.city.ground_height_m if scene.city.terrain is not None else None)
+    measurements = _above_datum(measurements, scene)
     if not related:
         _require_fit(measurements, scene)
     elif shift_m is not None and any(shift_m):
@@ -82,11 +81,12 @@ def as_measurements(given: Measurements | pd.DataFrame | Path | str,
                     scene: Scene | None) -> Measurements:
     """Return measurements in the frame of a scene, from an object, a file or a data frame.
 
-    A file or data frame goes through `in_scene_frame`; a `Measurements` object is only moved to the
-    scene's origin: not checked, no heights above ground converted. BadInput if it is none of these.
+    A file or data frame goes through `in_scene_frame`; a `Measurements` object is moved to the
+    scene's origin, but it is not checked whether it fits the map. BadInput if it is none of these.
     """
     if isinstance(given, Measurements):
-        return in_known_frame(given, None if scene is None else scene.config.origin, "the scene")
+        given = in_known_frame(given, None if scene is None else scene.config.origin, "the scene")
+        return _above_datum(given, scene)
     if isinstance(given, str | os.PathLike):
         given = Measurements.load(Path(given))
     elif isinstance(given, pd.DataFrame):
@@ -94,7 +94,14 @@ def as_measurements(given: Measurements | pd.DataFrame | Path | str,
     else:
         raise BadInput(f"measurements are needed, not {type(given).__name__}; pass "
                        "rt.Measurements, a data frame of links, or the path of measurements.csv")
-    return given.on_ground(None) if scene is None else in_scene_frame(given, scene)
+    return _above_datum(given, None) if scene is None else in_scene_frame(given, scene)
+
+
+def _above_datum(measurements: Measurements, scene: Scene | None) -> Measurements:
+    """Convert heights above the ground to heights above the datum; flat ground without terrain."""
+    if scene is None or scene.city.terrain is None:
+        return measurements.on_ground(None)
+    return measurements.on_ground(scene.city.ground_height_m)
 
 
 def in_known_frame(measurements: Measurements, origin: Origin | None, owner: str) -> Measurements:

@@ -82,6 +82,8 @@ FAULTS = (  # seed, change of a world, effect, values with their tolerance
     (5, cardioid, "antenna_pattern", {"": (70.0, 20.0)}),
     (6, anchor_elsewhere, "device_position_error", {}))
 
+FIRST_OF_SEVERAL = ("antenna_pattern", "device_position_error")  # what the fitted form leaves is described beside them
+
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("seed", "change", "effect", "values"), FAULTS, ids=[each[2] for each in FAULTS])
@@ -91,6 +93,8 @@ def test_what_was_done_to_a_world_is_named_and_measured(open_ground, seed, chang
     parameter = change(world)
     report = run(open_ground.measured(world))
     assert named(report)[0] == effect
+    if effect not in FIRST_OF_SEVERAL:
+        assert len(named(report)) == 1
     for name, (expected, within) in values.items():
         assert value(report, effect, name or parameter) == pytest.approx(expected, abs=within)
     if effect == "device_position_error":

@@ -9,7 +9,7 @@ import pytest
 from radiotwin.errors import BadInput
 from radiotwin.geo import between_frames
 from radiotwin.io.forms import Origin
-from radiotwin.links.alignment import in_scene_frame, search_shift
+from radiotwin.links.alignment import as_measurements, in_scene_frame, search_shift
 from radiotwin.links.measurements import Measurements
 from radiotwin.scene import Scene
 
@@ -117,3 +117,11 @@ def test_a_ride_with_gps_errors_is_in_the_frame(rbm):
     np.testing.assert_array_equal(ride.receiver_m, receiver_m)
     with pytest.raises(BadInput, match="not in one frame"):
         in_scene_frame(measured(receiver_m + [60.0, 0.0, 0.0]), rbm)
+
+
+@pytest.mark.parametrize("with_map", [True, False])
+def test_heights_above_the_ground_count_in_an_object_as_in_a_table(rbm, with_map):
+    table = measured(walked(rbm, 0, 30)).table.drop(columns="receiver_z_m").assign(receiver_above_ground_m=25.0)
+    devices = measured(np.zeros((1, 3))).devices
+    taken = as_measurements(Measurements(table, devices), rbm if with_map else None)
+    assert (taken.receiver_m[:, 2] == 25.0).all() and "receiver_above_ground_m" not in taken.table
