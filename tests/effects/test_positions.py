@@ -7,6 +7,7 @@ import pytest
 
 from radiotwin.effects.catalogue.clock_offset import ReceiverClockOffset
 from radiotwin.effects.catalogue.position_errors import DevicePositionError, ReceiverPositionError
+from radiotwin.effects.params import Estimate
 from tests.effects.conftest import law_db, with_params
 
 DEVICES_M = np.array([[0.0, 0, 1.5], [150, 40, 1.5], [150, 40, 1.5]])  # the third shares the mast of the second
@@ -43,6 +44,14 @@ def test_a_mast_elsewhere_changes_its_own_links_and_is_proposed_as_one(links, vi
     assert params.device == 1 and np.hypot(params.move_m[0] - 36, params.move_m[1] + 22) < 15
     found = replace(given, found=(DevicePositionError().with_params(params),))
     assert all(other.device == 0 for other in DevicePositionError().propose(found))
+
+
+def test_each_device_of_a_mast_is_corrected_from_where_it_was_declared(links):
+    beside_m = links.device_m + [[0, 0, 0], [0, 0, 0], [0.6, -0.3, 0]]
+    found = with_params(DevicePositionError, device=1, move_m=(36.0, -22.0)).parameters(
+        links.with_devices(beside_m), Estimate(np.zeros(0), (), np.ones((2, 2))))
+    values = [found[f"{axis}_m[{links.device_names[device]}]"].value for device in (1, 2) for axis in "xy"]
+    assert values == pytest.approx([186.0, 18.0, 186.6, 17.7])
 
 
 def test_a_receiver_elsewhere_changes_its_own_links_and_is_proposed_with_its_direction(links, view):

@@ -84,13 +84,12 @@ class _MovedDevices(_PositionError):
         return links.with_devices(device_m)
 
     def positions(self, links: Links, estimate: Estimate, when: str = "") -> dict[str, Parameter]:
-        """Report x and y of moved devices, all as `params.device` [m]; `when` follows names."""
-        given_m = links.device_m[self.params.device, :2]
+        """Report the corrected x and y of each moved device [m]; `when` follows its name."""
         return {f"{axis}_m[{links.device_names[device]}{when}]": Parameter.normal(
                     old_m + move_m, sd, "m", Allowed(old_m - MAX_MOVE_M, old_m + MAX_MOVE_M))
                 for device in self.devices(links)
-                for axis, old_m, move_m, sd in zip("xy", given_m, self.params.move_m,
-                                                   estimate.params_sd, strict=True)}
+                for axis, old_m, move_m, sd in zip("xy", links.device_m[device], self.params.move_m,
+                                                   estimate.params_sd)}
 
 
 class DevicePositionError(_MovedDevices):
