@@ -97,6 +97,13 @@ def test_a_fault_is_one_group_of_the_links_that_have_it(fault, seed):
         assert found.size.low - 0.5 < np.median(change(readings, 0.0)[found.rows]) < found.size.high + 0.5
         assert found.size.high - found.size.low < 3.0 and found.sight == "all"
         assert np.array_equal(found.rows, change(readings, 0.0) != 0)
+    if fault == "garbage flight":
+        assert found.size.unit == "times" and found.size.value > 1.5
+    if fault == "drift":
+        assert found.along == "time_s" and found.size.low < 4.0 / np.sqrt(2) < found.size.high + 0.5
+    if fault == "a minute":
+        low_s, high_s = found.ranges["time_s"]
+        assert low_s < 640 and high_s < 720
 
 
 def test_nothing_stands_out_where_nothing_is_wrong():
