@@ -34,7 +34,6 @@ from radiotwin.links import Links
 from radiotwin.propagation.laws.followed_paths import Rays
 
 MIN_LINKS = 100  # of a device, to fit its antenna
-MIN_NATS = 4.0  # log-likelihood gain above which a pattern is proposed
 MAX_PROPOSE_LINKS = 300  # of a device, drawn at random for the proposal
 LEVEL_SD_DB = 15.0  # prior standard deviation of the maximum gain about the channel's level
 MIN_HEADING_SD = 0.05  # sd of sine plus cosine below which the heading counts as constant

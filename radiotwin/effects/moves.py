@@ -9,13 +9,11 @@ from typing import Any
 import numpy as np
 from typing_extensions import override
 
-from radiotwin.effects.arrays import subsample
+from radiotwin.effects.arrays import MIN_LINKS, MIN_NATS, subsample
 from radiotwin.effects.base import Effect, GainEffect, LevelAt, ResidualView, Term
 from radiotwin.links import Links
 
-MIN_LINKS = 60  # of an end whose position is tested
 MAX_ENDS = 60  # ends whose positions are tested; more take too long
-MIN_NATS = 6.0  # log-likelihood gain above which a move is proposed
 MAX_PROPOSE_LINKS = 600  # of an end, drawn at random to test moves
 
 

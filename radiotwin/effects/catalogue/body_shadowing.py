@@ -14,8 +14,8 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from radiotwin.effects.antennas import MIN_NATS, BodyFrameEffect, linear, report_patterns
-from radiotwin.effects.arrays import subsample
+from radiotwin.effects.antennas import BodyFrameEffect, linear, report_patterns
+from radiotwin.effects.arrays import MIN_NATS, subsample
 from radiotwin.effects.base import ResidualView
 from radiotwin.effects.params import (
     EffectParams,

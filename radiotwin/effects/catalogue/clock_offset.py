@@ -9,9 +9,9 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from radiotwin.effects.arrays import frequent_labels
+from radiotwin.effects.arrays import MIN_LINKS, frequent_labels
 from radiotwin.effects.base import ResidualView
-from radiotwin.effects.moves import MAX_ENDS, MIN_LINKS, MovedEnd
+from radiotwin.effects.moves import MAX_ENDS, MovedEnd
 from radiotwin.effects.params import (
     EffectParams,
     Estimate,

@@ -26,13 +26,12 @@ from radiotwin.effects.antennas import (
     LEVEL_SD_DB,
     MAX_PROPOSE_LINKS,
     MIN_LINKS,
-    MIN_NATS,
     VERTICALS_DEG,
     Departures,
     SectorEffect,
     SectorPattern,
 )
-from radiotwin.effects.arrays import subsample
+from radiotwin.effects.arrays import MIN_NATS, subsample
 from radiotwin.effects.base import LevelAt, ResidualView, Term
 from radiotwin.effects.params import (
     QUANTILE_90,

@@ -15,7 +15,7 @@ from pydantic import Field
 from scipy.stats import t
 from typing_extensions import override
 
-from radiotwin.effects.arrays import frequent_labels
+from radiotwin.effects.arrays import MIN_LINKS, frequent_labels
 from radiotwin.effects.base import GainEffect, LevelAt, ResidualView, Term
 from radiotwin.effects.comparison import (
     by_precision,
@@ -37,7 +37,6 @@ from radiotwin.effects.patterns import Pattern, timed_members
 from radiotwin.links import Links, evidence_blocks
 from radiotwin.links.sites import site_of
 
-MIN_LINKS = 60  # links with a time of a receiver or a flight
 MIN_INSIDE = 20  # least number of links in the window
 MAX_INSIDE = 0.5  # largest share of the links in the window: more are the usual state
 MIN_NATS = 10.0  # log-likelihood gain above which an episode is proposed

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from radiotwin.effects.arrays import ends_above, ends_above_ground
+from radiotwin.effects.arrays import MIN_NATS, ends_above, ends_above_ground
 from radiotwin.effects.base import GainEffect, ResidualView
 from radiotwin.effects.boxes import (
     CELL_M,
@@ -32,7 +32,6 @@ from radiotwin.effects.patterns import WIDE_M, Pattern, lengths_in_boxes
 from radiotwin.effects.places import Mark
 from radiotwin.links import Links
 
-MIN_NATS = 6.0  # log-likelihood gain above which a cell is proposed
 MAX_CELLS = 3  # proposed cells, each with all `SIDES_M`
 SIDES_M = (25.0, 55.0)  # sides of a proposed box
 MIN_HEIGHT_M, MAX_PROPOSED_HEIGHT_M = 3.0, 26.0  # height of tree tops

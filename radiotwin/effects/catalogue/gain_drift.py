@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import AfterValidator, Field
 from typing_extensions import override
 
-from radiotwin.effects.arrays import frequent_labels
+from radiotwin.effects.arrays import MIN_LINKS, MIN_NATS, frequent_labels
 from radiotwin.effects.base import Effect, GainEffect, LevelAt, ResidualView, Term
 from radiotwin.effects.params import (
     Allowed,
@@ -29,10 +29,8 @@ from radiotwin.effects.patterns import Pattern, timed_members
 from radiotwin.links import Links
 from radiotwin.links.sites import inseparable_end
 
-MIN_LINKS = 60  # links with a time of a receiver or device
 MIN_FLIGHTS = 3  # of a device: within a flight, time and position change together
 MAX_DEVICES = 200  # bounds the time of the search
-MIN_NATS = 5.0  # log-likelihood gain above which a drift is proposed
 MIN_SIDE = 20  # least number of links before and after a step
 MIN_GAP_SD = 3.0  # least size of a step [standard deviations between flights]
 MAX_PROPOSALS = 2  # receivers or devices proposed in one step of the search

@@ -15,7 +15,7 @@ from pydantic import Field
 from scipy.constants import speed_of_light
 from typing_extensions import override
 
-from radiotwin.effects.arrays import squares_about_mean, subsample
+from radiotwin.effects.arrays import MIN_NATS, squares_about_mean, subsample
 from radiotwin.effects.base import GainEffect, ResidualView
 from radiotwin.effects.params import EffectParams, Estimate, Metres, Parameter, Variation
 from radiotwin.links import Links
@@ -23,7 +23,6 @@ from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.materials import permittivity
 
 MIN_LINKS = 100  # with line of sight
-MIN_NATS = 4.0  # log-likelihood gain above which a ground is proposed
 MAX_PROPOSE_LINKS = 3000  # drawn at random for the proposal
 MAX_PROPOSALS = 2
 # Grid of trial values; roughness and height in wavelengths, the height within MAX_HEIGHT_M.

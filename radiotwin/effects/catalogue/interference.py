@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from radiotwin.effects.arrays import NEPERS, subsample
+from radiotwin.effects.arrays import MIN_NATS, NEPERS, subsample
 from radiotwin.effects.base import LevelAt, ReceiverEffect, ResidualView, Term
 from radiotwin.effects.params import Decibels, EffectParams, Estimate, Metres, Parameter, Variation
 from radiotwin.effects.places import Mark
@@ -28,7 +28,6 @@ MAX_CELLS, MIN_CELL_M = 300, 20.0  # number and least side of the cells of the s
 QUANTILES = (0.05, 0.2, 0.4, 0.6, 0.8)  # of readings minus the emitter's path gain: trial levels
 MAX_LINKS = 2000  # drawn at random for the search
 MAX_PROPOSALS, APART_M = 2, 60.0  # number of proposals, and least distance between them
-MIN_NATS = 4.0  # log-likelihood gain above which an emitter is proposed
 
 
 class Interference(ReceiverEffect):

@@ -20,7 +20,7 @@ from pydantic import Field
 from scipy.special import expit, logit, stdtr
 from typing_extensions import override
 
-from radiotwin.effects.arrays import frequent_labels
+from radiotwin.effects.arrays import MIN_LINKS, MIN_NATS, frequent_labels
 from radiotwin.effects.base import DetectionEffect, ResidualView
 from radiotwin.effects.comparison import compared_where_possible_db
 from radiotwin.effects.params import (
@@ -44,8 +44,6 @@ MIN_RUNS = 4  # least number of separate periods with low levels
 MAX_RUN = 0.5  # largest share of the low instants in the longest period
 MAX_OTHERS = 0.3  # largest share of low readings of other receivers, relative to this one's
 MIN_SEPARATION = 3.0  # least distance between the states [error scales]
-MIN_LINKS = 60  # of a receiver, with line of sight
-MIN_NATS = 5.0  # log-likelihood gain above which losses of a receiver are proposed
 STRONGEST = 0.25  # share of the strongest links, whose gain must also be positive
 MIN_DEVICE_LINKS = 20  # of a device, to test whether its links gain
 MIN_DEVICES = 0.6  # share of those devices whose links must gain

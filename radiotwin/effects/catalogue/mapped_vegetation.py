@@ -11,14 +11,14 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from radiotwin.effects.arrays import city_of
+from radiotwin.effects.arrays import MIN_LINKS, city_of
 from radiotwin.effects.base import GainEffect, ResidualView
 from radiotwin.effects.losses import UNKNOWN_MAX_LOSS_DB, max_loss_db
 from radiotwin.effects.params import Allowed, EffectParams, Estimate, Parameter, quantity
 from radiotwin.links import Links
 from radiotwin.scene.vegetation import KINDS
 
-MIN_THROUGH_M, MIN_LINKS = 3.0, 60  # least length in vegetation, and number of such links
+MIN_THROUGH_M = 3.0  # least length in vegetation of a link that counts
 SPECIFIC_DB_M = (0.05, 0.15, 0.4, 1.0)  # start values
 MIN_SPECIFIC_DB_M = 0.005  # 0.5 dB over 100 m; a lower value is no loss
 

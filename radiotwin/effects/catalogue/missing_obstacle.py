@@ -17,7 +17,7 @@ from pydantic import Field
 from scipy.constants import speed_of_light
 from typing_extensions import override
 
-from radiotwin.effects.arrays import city_of, ends_above, ends_above_ground, subsample
+from radiotwin.effects.arrays import MIN_NATS, city_of, ends_above, ends_above_ground, subsample
 from radiotwin.effects.base import Effect, GainEffect, LevelAt, ResidualView, Term
 from radiotwin.effects.boxes import (
     ESTIMATED_PLACES,
@@ -52,7 +52,6 @@ from radiotwin.effects.places import Correction, Mark
 from radiotwin.links import Links
 from radiotwin.scene.citymap import CONCRETE, CityMap
 
-MIN_NATS = 6.0  # log-likelihood gain above which a cell is proposed
 MAX_PROPOSALS = 4
 SHIFTS_M = (-8.0, 0.0, 8.0)  # trial shifts from a cell's centre, to the east and to the north
 SQUARES_M, RECTANGLES_M = (6.0, 12.0, 24.0), ((20.0, 8.0), (36.0, 12.0), (40.0, 24.0))  # trial

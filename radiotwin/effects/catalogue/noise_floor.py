@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from radiotwin.effects.arrays import NEPERS, add_power, frequent_labels
+from radiotwin.effects.arrays import MIN_NATS, NEPERS, add_power, frequent_labels
 from radiotwin.effects.base import ReceiverEffect, ResidualView
 from radiotwin.effects.params import (
     Decibels,
@@ -27,7 +27,6 @@ from radiotwin.links import Links
 
 MIN_LINKS = 40  # of a receiver, to estimate its floor
 MIN_RECEIVERS = 3  # with a floor, for their median to apply to other receivers
-MIN_NATS = 2.0  # log-likelihood gain above which a floor of single receivers is proposed
 QUANTILES = (0.01, 0.05, 0.1, 0.2, 0.35, 0.5)  # of a receiver's readings: trial floors
 COMMON_QUANTILES = (0.03, 0.15)  # trial floors of all receivers at once
 MAX_BELOW, BELOW_DB = 0.01, 6.0  # largest share of readings so far below the floor

@@ -11,9 +11,15 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from radiotwin.effects.arrays import frequent_anchors, frequent_labels, subsample
+from radiotwin.effects.arrays import (
+    MIN_LINKS,
+    MIN_NATS,
+    frequent_anchors,
+    frequent_labels,
+    subsample,
+)
 from radiotwin.effects.base import ResidualView
-from radiotwin.effects.moves import MAX_ENDS, MAX_PROPOSE_LINKS, MIN_LINKS, MIN_NATS, MovedEnd
+from radiotwin.effects.moves import MAX_ENDS, MAX_PROPOSE_LINKS, MovedEnd
 from radiotwin.effects.params import (
     Allowed,
     DeviceIndex,

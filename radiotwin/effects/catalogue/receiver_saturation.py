@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from radiotwin.effects.arrays import frequent_labels, squares_about_mean
+from radiotwin.effects.arrays import MIN_NATS, frequent_labels, squares_about_mean
 from radiotwin.effects.base import ReceiverEffect, ResidualView
 from radiotwin.effects.params import (
     Decibels,
@@ -25,7 +25,6 @@ from radiotwin.links import Links
 
 MIN_STRONG = 20  # links above the saturation level
 MIN_LINKS = 5 * MIN_STRONG  # of a receiver
-MIN_NATS = 3.0  # log-likelihood gain above which compression of a receiver is proposed
 SMOOTHNESS = (1.0, 3.0)  # trial values
 QUANTILES = (0.6, 0.7, 0.8, 0.88, 0.94, 0.98)  # of the predicted levels: trial saturation levels
 

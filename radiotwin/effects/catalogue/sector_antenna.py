@@ -11,7 +11,6 @@ from radiotwin.effects.antennas import (
     FRONT_TO_BACK_DB,
     MAX_PROPOSE_LINKS,
     MIN_LINKS,
-    MIN_NATS,
     VERTICALS_DEG,
     Departures,
     SectorEffect,
@@ -19,7 +18,7 @@ from radiotwin.effects.antennas import (
     report_patterns,
     vary_patterns,
 )
-from radiotwin.effects.arrays import frequent_anchors, subsample
+from radiotwin.effects.arrays import MIN_NATS, frequent_anchors, subsample
 from radiotwin.effects.base import ResidualView
 from radiotwin.effects.params import Estimate, Parameter, Variation, quantities
 from radiotwin.effects.patterns import Pattern, members

@@ -12,8 +12,8 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from radiotwin.effects.antennas import MIN_NATS, BodyFrameEffect, report_patterns
-from radiotwin.effects.arrays import squares_about_mean
+from radiotwin.effects.antennas import BodyFrameEffect, report_patterns
+from radiotwin.effects.arrays import MIN_NATS, squares_about_mean
 from radiotwin.effects.base import ResidualView
 from radiotwin.effects.params import EffectParams, Estimate, Parameter, ReceiverIndex, quantity
 from radiotwin.links import Links

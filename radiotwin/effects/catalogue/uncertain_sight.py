@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from typing_extensions import override
 
-from radiotwin.effects.arrays import city_of
+from radiotwin.effects.arrays import MIN_LINKS, city_of
 from radiotwin.effects.base import GainEffect, LevelAt, ResidualView, Term
 from radiotwin.effects.params import Allowed, EffectParams, Estimate, Parameter, quantity
 from radiotwin.links import Links
@@ -23,7 +23,6 @@ WALL_SD_M, HEIGHT_SD_M = 1.0, 2.0
 MAPS = 8  # number of perturbed maps, in addition to the given one
 PRIOR_SD_DB = 20.0  # of the difference of level between both classes
 CONTRASTS_DB = (6.0, 12.0, 20.0)  # start values
-MIN_LINKS = 60  # with an uncertain line of sight
 
 
 class UncertainSight(GainEffect):
