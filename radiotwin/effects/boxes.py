@@ -312,16 +312,16 @@ def back_project(a_m: np.ndarray, b_m: np.ndarray,
 
 def knife_edge_db(over_m: np.ndarray, first_m: np.ndarray | float, second_m: np.ndarray | float,
                   wavelength_m: float) -> np.ndarray:
-    """Compute the diffraction loss (n,) over a knife edge (ITU-R P.526-15, Eq. 26) [dB].
+    """Compute the diffraction loss (n,) over a knife edge (ITU-R P.526-15, 4.1) [dB].
 
     Args:
-        over_m: (n,) height of the edge above the straight line [m].
+        over_m: (n,) height of the edge above the straight line [m]; negative: below it.
         first_m: (n,) distance of the edge from the first end; at least 1 is used [m].
         second_m: (n,) distance from the second end; at least 1 is used [m].
         wavelength_m: wavelength [m].
     """
-    near, far = np.maximum(first_m, 1.0), np.maximum(second_m, 1.0)
-    return terrain.knife_edge_db(over_m * np.sqrt(2 * (near + far) / (wavelength_m * near * far)))
+    d1_m, d2_m = np.maximum(first_m, 1.0), np.maximum(second_m, 1.0)
+    return terrain.knife_edge_db(over_m * np.sqrt(2 * (d1_m + d2_m) / (wavelength_m * d1_m * d2_m)))
 
 
 def two_edges_db(first_over_m: np.ndarray, second_over_m: np.ndarray,

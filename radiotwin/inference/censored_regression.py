@@ -216,7 +216,10 @@ def fit(problem: CensoredRegression, start: FitResult | None = None) -> FitResul
 
 
 def _least_squares(problem: CensoredRegression) -> np.ndarray:
-    """Compute start coefficients (p,) by ridge regression on the detected levels."""
+    """Compute start coefficients (p,): one Gauss-Newton step from 0, on detected levels only.
+
+    It is a ridge regression: coefficients have their priors, errors the scale `FIRST_SCALE_DB`.
+    """
     known = np.isfinite(problem.level_db)
     first_scale_db = np.full(int(problem.group.max()) + 1, FIRST_SCALE_DB)
     predicted = problem.linearise(np.zeros(len(problem.prior_sd_db)), first_scale_db)

@@ -49,7 +49,7 @@ def is_within(path: Path, *folders: Path) -> bool:
 
 
 def require_within(folder: Path, path: Path, source: str) -> Path:
-    """Return a path if it is within a folder, with links resolved.
+    """Return a path unchanged; raise unless it is, with links resolved, within a folder.
 
     Args:
         folder: the only folder that may be read.

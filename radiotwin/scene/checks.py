@@ -90,10 +90,11 @@ def _has_ground_below(surfaces: Surfaces) -> bool:
 
 
 def check_units(surfaces: Surfaces) -> list[Problem]:
-    """Return a warning if sizes look like another unit than metres, or an error above 100 km.
+    """Return an error if a city is wider than 100 km, a warning if it seems not to be in metres.
 
-    It looks like kilometres if nothing is 1 m tall and the city narrower than 100 m; like feet,
-    centimetres or millimetres if half of the parts with walls are taller than `MAX_MEDIAN_M`.
+    Only parts with walls tell. It looks like kilometres if none is 1 m tall and the city narrower
+    than 100 m; like feet, centimetres or millimetres if half of them are taller than
+    `MAX_MEDIAN_M`.
     """
     low, high = surfaces.part_bounds()
     heights = (high - low)[surfaces.wall_share > 0.1, 2]  # of parts with walls

@@ -248,7 +248,7 @@ def sionna_scenes() -> dict[str, Path]:
 
 
 def find_source(source: Path | str) -> Path:
-    """Return the file of a city: a path, or `sionna:NAME` for a scene of sionna-rt.
+    """Return the file of a scene or model, not of a map: a path, or `sionna:NAME` of sionna-rt.
 
     Raises:
         BadInput: Unknown name (the message lists the known ones), no such file, or neither XML nor

@@ -71,10 +71,10 @@ class TwinRegressor:
         return self
 
     def predict(self, X: pd.DataFrame) -> np.ndarray:  # noqa: N803
-        """Return the mean level (n,) of links [dB or dBm].
+        """Return the mean level (n,) of each row of X [dB or dBm]; levels in X are not used.
 
         Raises:
-            BadInput: see `Twin.predict`, or not fitted yet.
+            BadInput: not fitted yet, X is no data frame or has no `device`, or see `Twin.predict`.
         """
         if not hasattr(self, "twin_"):
             raise BadInput("this TwinRegressor is not fitted; call fit(X, y) first")

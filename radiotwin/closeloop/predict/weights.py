@@ -167,11 +167,10 @@ def _weights(held_out: HeldOut, quadrants: HeldOut, half_m: float, sd_ratio: tup
 
 def _sd_ratio(held_out: HeldOut, quadrants: HeldOut, weights: np.ndarray, half_m: float,
               dof: float) -> tuple[float, float]:
-    """Fit the error scale of the combination over that of its predictors, by likelihood.
+    """Fit two factors of the combined predictors' error scale, near and far from measurements.
 
-    One near and one far from measurements.
-
-    `quadrants` are used, too, as errors far from measurements show only in them.
+    By likelihood, with a penalty for factors that differ, on a sample of about `SD_LINKS` held-out
+    links. `quadrants` are used, too, as errors far from measurements show only in them.
     """
     links = HeldOut.join([held_out, quadrants])
     links = links.select(np.arange(0, len(links), max(len(links) // SD_LINKS, 1)))

@@ -231,10 +231,11 @@ class Hypotheses:
                 and len(np.unique(each[0][known])) >= KNOTS}  # else it is a label
 
     def _curves(self) -> Iterator[tuple[str, np.ndarray]]:
-        """Yield name and design columns (n, q) of each unnamed cause.
+        """Yield name and design columns (n, q) of each kind of cause that has no name.
 
-        Such a cause is a level of each flight of a receiver or device, or a curve over a variable,
-        common to all links or one for each receiver or device; at most `MAX_COLUMNS` columns.
+        First a level of each (receiver, flight), and of each (device, flight); then, for each
+        variable, a curve common to all links, one for each receiver, one for each device. Kinds
+        with more than `MAX_COLUMNS` columns, or of a single receiver or device, are left out.
         """
         links = self.links
         ends = {"": None, "receiver": links.receiver, "device": links.device}

@@ -280,10 +280,12 @@ def _gap_s(links: Links, rows: np.ndarray, when_s: float) -> tuple[float, float]
 
 def _candidates(links: Links, residual_db: np.ndarray, weight: np.ndarray,
                 between_flights: bool) -> Iterator[tuple[float, str, float]]:
-    """Yield (gain [nats], form, number) of each drift that a receiver's or device's times allow.
+    """Yield (gain [nats], form, number) of drifts that a receiver's or device's times allow.
 
-    The number is a time constant or a time [s]. `between_flights` restricts steps to gaps between
-    flights: within one, position changes with time.
+    The number is a time constant or a time [s]. The first one is a step without any gain. Of steps
+    only the likeliest is yielded, if it exceeds the scatter of flights. `between_flights` restricts
+    steps to times between flights: within a flight, position changes with time. Clocks that restart
+    in each flight allow only warm-ups on each flight.
     """
     time_s, comparable = links.time_s, not links.time_restarts
     yield 0.0, "step", float(time_s.mean())

@@ -82,11 +82,11 @@ def _building_layers(columns: Mapping[str, Sequence[str]]) -> list[str]:
 def join_layers(path: Path, parts: Mapping[str, MapFile], problems: list[Problem]) -> MapFile:
     """Join the buildings of all layers that were read.
 
-    In 3D BAG, the outline of a building is only used if it has no roofs (greenhouses); roofs get
-    the ground's height from the outline.
+    In 3D BAG, which is known by a layer called `OUTLINES`, an outline is only used for a building
+    without roofs, such as a greenhouse; roofs without a ground height get the outline's.
 
     Raises:
-        BadInput: layers hold the same buildings.
+        BadInput: layers of another file hold the same buildings.
     """
     plans_m = [part.plan_m for part in parts.values() if part.plan_m != 1.0]
     found = MapFile([], [one for part in parts.values() for one in part.left_out], problems,

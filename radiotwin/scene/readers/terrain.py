@@ -110,11 +110,13 @@ def approximate(grid: HeightGrid, tolerance_m: float, max_faces: int) -> GroundM
 
     Args:
         grid: heights; at least 2 x 2 nodes.
-        tolerance_m: allowed vertical distance of a node from the triangles [m].
-        max_faces: maximum number of triangles, but for those of the first triangulation.
+        tolerance_m: vertical distance of a node from the triangles [m] that is aimed at.
+        max_faces: maximum number of triangles, even if nodes are then farther away; the first
+            triangulation, of the border, may have more.
 
     Returns:
-        Triangles whose corners are nodes of the grid; they cover its rectangle without gaps.
+        Triangles whose corners are nodes of the grid; they cover its rectangle without gaps. Their
+        largest and RMS vertical distance from the nodes are told.
     """
     height_m = np.asarray(grid.height_m, dtype=float)
     rows, columns = np.indices(height_m.shape)

@@ -161,7 +161,10 @@ def _centres(low: float, high: float, width: float) -> np.ndarray:
 
 def distinct_modes(xy_m: np.ndarray, log_likelihood: np.ndarray, n_modes: int,
                    separation_m: float) -> np.ndarray:
-    """Return the likeliest of positions (p, 2) [m], at most n_modes, far from each other."""
+    """Return the likeliest of positions (p, 2) [m], `separation_m` or more apart, likeliest first.
+
+    At most `n_modes`; those without a finite log-likelihood (p,) are left out.
+    """
     modes = np.empty((0, 2))
     left = np.isfinite(log_likelihood)
     while left.any() and len(modes) < n_modes:
