@@ -7,6 +7,7 @@ Expected behaviour: from 5 flights, the mean over 2 seeds of the segmented netwo
 Results: docs/results.md, with ten seeds.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -69,16 +70,20 @@ def test_shipped_maps_pass_the_gates(city):
 
 @pytest.mark.llvm
 def test_shipped_maps_are_what_the_tracer_gives(city):
-    """60 positions of each device, traced now in other batches: the same to within the map's own numerical noise."""
+    """60 positions of each device, traced now in other batches: the same but for the ground.
+
+    The maps were traced with Sionna RT's own diffraction, and with flat ground as a slab of 0.1 m; it is a half space now.
+    """
     from radiotwin.trace import SolverSettings, trace_gains
 
     scene, truth = city
     index = np.random.default_rng(0).choice(len(scene.lattice.positions_m), 60, replace=False)
-    again_db = trace_gains(scene, scene.device_m[:3], scene.lattice.positions_m[index], SolverSettings.of_quality())
+    settings = replace(SolverSettings.of_quality(), diffraction="sionna")
+    again_db = trace_gains(scene, scene.device_m[:3], scene.lattice.positions_m[index], settings)
     again_db[again_db < scene.config.gain_limit_db] = np.nan
     shipped_db = truth.gain_db.reshape(len(truth.devices), -1)[:3, index]
     both = np.isfinite(again_db) & np.isfinite(shipped_db)
     assert both.sum() > 60
     assert (np.isfinite(again_db) != np.isfinite(shipped_db)).mean() < 0.05
     difference_db = np.abs(again_db - shipped_db)[both]
-    assert np.median(difference_db) < 0.1 and np.quantile(difference_db, 0.9) < 1.5
+    assert np.median(difference_db) < 0.3 and np.quantile(difference_db, 0.9) < 1.5
