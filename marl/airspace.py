@@ -17,9 +17,9 @@ STEP_M = 3.0  # approximate spacing of the points that are tested for buildings 
 def keep_out(scene: Scene, areas: Sequence[BaseGeometry], clearance_m: float) -> np.ndarray:
     """Return the mask (nz, ny, nx) of lattice positions that are closed to UAVs.
 
-    A position is closed if any part of its cell is; the insides of buildings are added by the
-    mission. Closed are no-fly `areas` in the local frame, at all heights, and what is nearer to a
-    building than `clearance_m`, sideways and above it.
+    Closed are positions whose cell touches one of the no-fly `areas` (in the local frame, at all
+    heights), and those from which half a move to a neighbour comes within `clearance_m` [m] of a
+    building, sideways or above it. The insides of buildings are added by the mission.
     """
     lattice = scene.lattice
     blocked = np.zeros(lattice.shape, dtype=bool)  # a mission adds the insides of buildings

@@ -149,7 +149,7 @@ class Campaign:
         rows: log with a row for each round; `docs/marl.md` explains the columns.
         blocks: records of training, several for each round.
         flights: final evaluation in the truth.
-        learn_s: duration of the last fit of a twin [s].
+        learn_s: duration of the last simulated real flight and fit of a twin [s].
     """
 
     def __init__(self, run: RunSettings, scene: Scene, truth: RadioMap | None,
@@ -214,7 +214,7 @@ class Campaign:
         self.learn_s = time.perf_counter() - started
 
     def measuring_policy(self, learner: Learner, rng: np.random.Generator) -> Policy:
-        """Return who flies the next real flight: random cells in turn, chance, or the learner."""
+        """Return the next real flight's policy: random waypoints or actions, or the learner's."""
         kind = self.run.measure if self.twin is not None else self.run.first_flight
         if kind == "waypoints":
             return PlanPolicy(waypoint_actions(self.scene, self.in_truth(), rng))

@@ -94,17 +94,18 @@ class Belief:
         with np.errstate(divide="ignore"):
             self._state = _State(np.log(prior.weight), np.zeros((devices, candidates, errors)),
                                  covariance)
-        self._heard = np.zeros(devices, dtype=bool)
+        self._detected = np.zeros(devices, dtype=bool)
         self._cell = mission.start.copy()  # cell of each UAV's last readings
         self._table = _expected_table(mission)
 
     def hear(self, uav: int, cell: np.ndarray, snr_db: np.ndarray) -> None:
         """Update the belief by a UAV's readings (K,) [dB] in a cell; -inf: not detected."""
         moved_m = self._mission.step_m * float(np.hypot(*(cell - self._cell[uav])))
-        kept = math.exp(-moved_m / self.prior.length_m)
-        _hear(self.prior, self._state, uav, int(self._mission.level[uav]), int(cell[0]),
-              int(cell[1]), kept, snr_db.astype(float), float(self._mission.detection_db))
-        self._heard |= np.isfinite(snr_db)
+        correlation = math.exp(-moved_m / self.prior.length_m)
+        _update_filters(self.prior, self._state, uav, int(self._mission.level[uav]), int(cell[0]),
+                        int(cell[1]), correlation, snr_db.astype(float),
+                        float(self._mission.detection_db))
+        self._detected |= np.isfinite(snr_db)
         self._cell[uav] = cell
 
     @property
@@ -114,7 +115,7 @@ class Belief:
         evidence = np.exp(top) * np.exp(self._state.log_weight - top[:, None]).sum(axis=1)
         prior = self.prior.silent
         posterior = prior / np.maximum(prior + (1 - prior) * evidence, 1e-300)
-        return np.where(self._heard, 0.0, posterior)
+        return np.where(self._detected, 0.0, posterior)
 
     @property
     def weight(self) -> np.ndarray:
@@ -130,7 +131,7 @@ class Belief:
         prior = self.prior
         mission = self._mission
         value = np.zeros((mission.uavs, mission.devices, *prior.snr_db.shape[3:]), np.float32)
-        _value(prior, self._state, self.weight, mission.level, self._cell,
+        _add_expected_data(prior, self._state, self.weight, mission.level, self._cell,
                float(mission.step_m), self._table, value)
         return value
 
@@ -143,33 +144,35 @@ def _expected_table(mission: Mission) -> np.ndarray:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _hear(prior: Prior, state: _State, uav: int, level: int, row: int, column: int, kept: float,
-          snr_db: np.ndarray, limit_db: float) -> None:
+def _update_filters(prior: Prior, state: _State, uav: int, level: int, row: int, column: int,
+                    correlation: float, snr_db: np.ndarray, limit_db: float) -> None:
     """Update the Kalman filters of all candidate positions in `state` by a UAV's readings.
 
-    `kept` is the correlation of the map's error here with that at the UAV's last cell, `snr_db`
-    (K,) the readings, -inf if not detected, and `limit_db` the limit of detection.
+    `correlation` is that of the map's errors at this and at the UAV's last cell, `snr_db` (K,)
+    are the readings, -inf if not detected, and `limit_db` is the limit of detection. A reading of
+    a candidate that is never received in the cell lowers its log weight by 20; candidates with a
+    log weight below -700 are not updated any more.
     """
     devices, candidates, errors = state.mean.shape
-    at, lasting = uav + 1, math.sqrt(prior.share)
+    at, lasting_sd = uav + 1, math.sqrt(prior.share)
     gain = np.empty(errors)
     for k in range(devices):
         for i in range(candidates):
             if state.log_weight[k, i] < -700.0:
                 continue
             mean, covariance = state.mean[k, i], state.covariance[k, i]
-            mean[at] *= kept
+            mean[at] *= correlation
             for j in range(errors):
-                covariance[at, j] *= kept
-                covariance[j, at] *= kept
-            covariance[at, at] += 1.0 - kept * kept
+                covariance[at, j] *= correlation
+                covariance[j, at] *= correlation
+            covariance[at, at] += 1.0 - correlation * correlation
             expected_db = prior.snr_db[k, i, level, row, column]
             if expected_db == -np.inf:  # a candidate that is not heard here
                 if snr_db[k] > -np.inf:
                     state.log_weight[k, i] -= 20.0
                 continue
             sd_db = prior.sd_db[k, i, level, row, column]
-            slope = sd_db * lasting
+            slope = sd_db * lasting_sd
             variance = sd_db * sd_db * (1.0 - prior.share) + NOISE_DB * NOISE_DB
             for j in range(errors):
                 gain[j] = covariance[j, 0] + slope * covariance[j, at]
@@ -207,11 +210,15 @@ def _below(depth: float) -> tuple[float, float]:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _value(prior: Prior, state: _State, weight: np.ndarray, levels: np.ndarray, cell: np.ndarray,
-           step_m: float, table: np.ndarray, value: np.ndarray) -> None:
-    """Add the data expected in a slot, averaged over candidate positions, to `value`, in place."""
+def _add_expected_data(prior: Prior, state: _State, weight: np.ndarray, levels: np.ndarray,
+                       cell: np.ndarray, step_m: float, table: np.ndarray,
+                       value: np.ndarray) -> None:
+    """Add the data expected in a slot, averaged over candidate positions, to `value`, in place.
+
+    Candidates with a weight below `NEGLIGIBLE` and links that are never received add 0.
+    """
     uavs, devices, rows, columns = value.shape
-    lasting = math.sqrt(prior.share)
+    lasting_sd = math.sqrt(prior.share)
     near = np.zeros((rows, columns))
     for u in range(uavs):
         level, at = levels[u], u + 1
@@ -230,17 +237,20 @@ def _value(prior: Prior, state: _State, weight: np.ndarray, levels: np.ndarray, 
                         if snr_db == -np.inf:
                             continue
                         sd_db = prior.sd_db[k, i, level, r, c]
-                        slope = sd_db * lasting * near[r, c]
+                        slope = sd_db * lasting_sd * near[r, c]
                         snr_db += mean[0] + slope * mean[at]
                         variance = (sd_db * sd_db + covariance[0, 0] + 2 * slope * covariance[0, at]
                                     + slope * slope * (covariance[at, at] - 1.0))
-                        value[u, k, r, c] += weight[k, i] * _looked_up(
+                        value[u, k, r, c] += weight[k, i] * _interpolated(
                             table, snr_db, math.sqrt(max(variance, 0.0)))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _looked_up(table: np.ndarray, snr_db: float, sd_db: float) -> float:
-    """Interpolate the table of expected data bilinearly at a mean SNR and its sd [dB]."""
+def _interpolated(table: np.ndarray, snr_db: float, sd_db: float) -> float:
+    """Interpolate the table of expected data bilinearly at a mean SNR and its sd [dB].
+
+    Values outside the grid are clipped to it: -60 to 120 dB, sd 0 to 40 dB.
+    """
     x = min(max((snr_db + 60.0) * 2.0, 0.0), table.shape[0] - 1.000001)
     y = min(max(sd_db * 2.0, 0.0), table.shape[1] - 1.000001)
     a, b = int(x), int(y)

@@ -43,7 +43,11 @@ class Damaged(ValueError):
 
 
 def save_checkpoint(state: dict, path: Path) -> None:
-    """Write nested dicts and lists of numbers, texts, arrays, tensors and tables to a file."""
+    """Write nested dicts and lists of numbers, texts, arrays, tensors and tables to a file.
+
+    Tuples are read back as lists, and tables without their index, with columns that hold neither
+    numbers nor booleans as texts. Keys that begin with `$` raise TypeError.
+    """
     arrays: dict[str, np.ndarray] = {}
     text = json.dumps({"format": FORMAT, "state": _packed(state, arrays)}, allow_nan=False)
     with atomic_file(path) as file:
@@ -190,8 +194,8 @@ def require_log(records: Any, counts: Collection[str], others: Collection[str] =
                 largest: float = math.inf) -> list[dict]:
     """Return the records of a log, name -> number, if they are valid; raise Damaged otherwise.
 
-    `counts` are required whole numbers, `others` required numbers of at most `largest`, or NaN.
-    Further names are allowed.
+    `counts` are required whole numbers from 0, `others` required numbers. More names are allowed.
+    All values but counts are numbers within ±`largest`, or NaN; whole ones are from 0.
     """
     if not isinstance(records, list):
         raise Damaged("a log should be a list")

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.fft import fft2, next_fast_len
 
 from marl.mission import COSTS, MOVES, NO_OP, Mission
+from radiotwin.errors import BadInput
 from radiotwin.runtime.compiled import List, njit
 
 ACTION_COUNT = len(COSTS)
@@ -111,8 +112,8 @@ class Environment:
 class ManyWorlds:
     """W parallel flights, each in a mission of its own.
 
-    Missions may differ in size; arrays over UAVs are padded to `uavs`. Shadowing is drawn in every
-    slot.
+    Missions may differ in size; arrays over UAVs are padded to `uavs`. All shadowing is drawn anew
+    in every slot: a mission with a `shadowing_share` is refused (BadInput).
 
     Attributes:
         missions: W missions.
@@ -130,6 +131,9 @@ class ManyWorlds:
 
     def put(self, world: int, mission: Mission) -> None:
         """Replace the flight of a world (0 to W - 1) by a new flight of a mission."""
+        if mission.shadowing_share > 0:
+            raise BadInput(f"a mission has shadowing_share = {mission.shadowing_share:g}; "
+                           "ManyWorlds needs 0: all shadowing is drawn anew in every slot")
         frame = empty_frame((1,), mission)
         frame.cell[0], frame.battery[0] = mission.start, mission.battery
         frame.data_units[0] = mission.data_units
@@ -155,7 +159,8 @@ class CorrelatedField:
 
     def __init__(self, shape: tuple[int, int], step_m: float, length_m: float) -> None:
         self._shape = shape
-        # A torus that keeps opposite sides of the map three lengths apart, hence uncorrelated.
+        # A torus that keeps opposite sides of the map three lengths apart (correlation 0.05), or
+        # one side of the map if that is shorter; then the correlation is only approximate.
         around = [next_fast_len(side + min(side, int(np.ceil(3.0 * length_m / step_m))))
                   for side in shape]
         rows, columns = (np.minimum(np.arange(n), n - np.arange(n)) * step_m for n in around)
@@ -284,9 +289,9 @@ def _step(mission: Mission, frame: Frame, action: np.ndarray, lasting: np.ndarra
             if k >= 0:
                 # Throughput, capped by what is left (paper, Eq. 9).
                 left = frame.data_units[e, k]
-                taken = min(np.float32(rate(frame.snr_db[e, u, k], mission.rate_scale)), left)
-                frame.data_units[e, k] = left - taken
-                collected[e, u] = taken
+                units = min(np.float32(rate(frame.snr_db[e, u, k], mission.rate_scale)), left)
+                frame.data_units[e, k] = left - units
+                collected[e, u] = units
             frame.cell[e, u, 0] += MOVES[action[e, u], 0]
             frame.cell[e, u, 1] += MOVES[action[e, u], 1]
             frame.battery[e, u] -= COSTS[action[e, u]]
@@ -316,7 +321,11 @@ def state_size(mission: Mission) -> int:
 
 
 def observe(mission: Mission, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
-    """Return observations (E, U, observation_size) float32 and feasible actions (E, U, 6) bool."""
+    """Return observations (E, U, observation_size) float32 and feasible actions (E, U, 6) bool.
+
+    The data left at a device are 0 below the SNR threshold. Distance, dx and dy are 0 for a device
+    without a known position. Of a UAV out of reach only the SNR is seen; its other features are 0.
+    """
     shape = frame.battery.shape
     observation = np.empty((*shape, observation_size(mission)), dtype=np.float32)
     mask = np.empty((*shape, ACTION_COUNT), dtype=np.bool_)
@@ -325,7 +334,10 @@ def observe(mission: Mission, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
 
 
 def global_state(mission: Mission, frame: Frame) -> np.ndarray:
-    """Return the global state (E, state_size) float32 for the mixer."""
+    """Return the global state (E, state_size) float32 for the mixer.
+
+    The data left at all devices are exact; an unknown device position is (0.5, 0.5).
+    """
     state = np.empty((len(frame.battery), state_size(mission)), dtype=np.float32)
     _global_state(mission, frame, state)
     return state

@@ -25,7 +25,7 @@ COLOURS = ["#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9",  # 
            "#6a3d9a", "#f0e442"]
 MARKERS = "os^DvPX*"
 MAX_IMAGES = 60  # of an animation
-LEVEL_STYLES = ("--", ":", "-.")
+LEVEL_STYLES = ("--", ":", "-.", (0, (5, 1)))
 
 
 def choose_flight(flights: Flights, mission: Mission) -> int:
@@ -92,7 +92,7 @@ def curve_figure(curves: dict[str, list[dict]], levels: dict[str, float]) -> Fig
         colour = COLOURS[number % len(COLOURS)]
         axes.plot(x, ratio, marker=MARKERS[number % len(MARKERS)], color=colour, label=name)
         axes.fill_between(x, low, high, color=colour, alpha=0.18, linewidth=0)
-    for style, (name, level) in zip(LEVEL_STYLES, levels.items()):
+    for style, (name, level) in zip(LEVEL_STYLES, levels.items(), strict=False):
         axes.axhline(level, color="black", linestyle=style, linewidth=1.1,
                      label=f"{name}: {level:.2f}")
     axes.set(ylim=(0, 1.02), xlabel="real episodes",

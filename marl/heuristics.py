@@ -114,7 +114,8 @@ def greedy_actions(mission: Mission, frame: Frame, rng: np.random.Generator) -> 
 
     One after the other, each flying UAV claims the nearest unclaimed device with data, flies
     towards it along the larger axis, and hovers above it. If that is not feasible, it takes the
-    other axis, then a random feasible action.
+    other axis, then a random feasible action. Devices without a known position are never claimed;
+    a UAV without a target hovers if that is feasible, else takes a random feasible action.
     """
     flights, uavs = frame.battery.shape
     devices = len(mission.data_units)
@@ -152,7 +153,8 @@ def _move_towards_point(mission: Mission, row: int, column: int, target_m: np.nd
                         stop_m: float, mask: np.ndarray) -> int:
     """Return a feasible move from a cell towards a point (2,) [m], or hover within `stop_m` of it.
 
-    The larger axis comes first, then the other one; -1 if neither is feasible.
+    The larger axis comes first, then the other one, or a hover if the cell is within half a step
+    of the point on that axis; -1 if neither is feasible. Within half a step on both axes it hovers.
     """
     dx, dy = target_m[0] - column * mission.step_m, target_m[1] - row * mission.step_m
     along_x, along_y = abs(dx) > mission.step_m / 2, abs(dy) > mission.step_m / 2
@@ -172,7 +174,8 @@ def weighed_actions(mission: Mission, frame: Frame, weights: np.ndarray) -> np.n
     """Return actions (E, U) towards the device with the best score, see `WEIGHTS`.
 
     Each device goes to one UAV, the highest score first. A UAV that gets none flies to its best
-    one. If no move towards it is feasible, the UAV hovers while it can, then flies home.
+    one. If no move towards it is feasible, the UAV hovers while it can, then flies home. Devices
+    without a known position get no score.
 
     Args:
         mission: mission with the known positions of the devices.

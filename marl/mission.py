@@ -33,7 +33,7 @@ class Mission(NamedTuple):
     Attributes:
         snr_db: (L, K, ny, nx) float32 mean SNR [dB]; -inf = never received.
         sigma_db: (L, K, ny, nx) float32 standard deviation of the shadowing [dB].
-        steps_home: (U, ny, nx) int64 moves to the UAV's terminal.
+        steps_home: (U, ny, nx) int64 moves to the UAV's terminal; `UNREACHABLE` without a way.
         start: (U, 2) int64 start cell (row, column) of each UAV.
         battery: (U,) int64 battery at take-off [hovers = half battery units].
         level: (U,) int64 level of the maps at which each UAV flies.
@@ -137,7 +137,8 @@ def make_mission(scene: Scene, radio_map: RadioMap, known: Known, assignment: st
 
     Args:
         scene: scene with UAVs, radio, batteries, data and buildings.
-        radio_map: map over the scene's lattice. Devices that it lacks are never received. Its
+        radio_map: map over the scene's lattice. Devices that it lacks, and positions where its
+            gain is NaN, are never received; a `sigma_db` of NaN counts as 0. Its
             `sigma_db`, if any, is the standard deviation of shadowing; with the attributes
             `shadowing_share` and `shadowing_length_m` (`radiotwin.twin.shadowing`) a part of it
             lasts for a flight.

@@ -105,10 +105,13 @@ def plan_flights(twin: Twin, scene: Scene, settings: PlanSettings,
 
 
 def planned_scene(scene: Scene, twin: Twin, settings: PlanSettings) -> Scene:
-    """Return a scene with a twin's devices at its positions, and with the UAVs that fly.
+    """Return a scene with exactly a twin's devices at its positions, and the UAVs that fly.
+
+    Devices that the twin lacks are dropped. A device without a position is put into the middle of
+    the extent, one without a height to `ANTENNA_HEIGHT_M`.
 
     Raises:
-        BadInput: no UAV, or an unusable table of data.
+        BadInput: no UAV, a base outside the lattice, or an unusable table of data.
     """
     declared = {device.device: device for device in scene.config.devices}
     data = {} if settings.data is None else _read_data(settings.data,
@@ -144,7 +147,11 @@ def _read_data(path: Path, names: list[str]) -> dict[str, float]:
 
 
 def _uavs(scene: Scene, settings: PlanSettings) -> list[UavConfig]:
-    """Return the UAVs that fly: the scene's or copies, with battery and base of the settings."""
+    """Return the UAVs that fly: the scene's or copies, with battery and base of the settings.
+
+    The base is the nearest lattice point, at most one step away, or BadInput. A scene without UAVs
+    gets one, or as many as the settings say, at the lattice's altitudes in turn.
+    """
     templates, lattice = scene.config.uavs, scene.lattice
     path = scene.folder / "scene.toml"
     changes: dict[str, float] = {}

@@ -262,8 +262,8 @@ def improve(mission: Mission, candidates: Candidates, tour: np.ndarray, count: n
 def expected_data(mission: Mission) -> np.ndarray:
     """Return the expected data units (L, K, ny, nx) float32 of one slot on each link.
 
-    It is the probability that the SNR reaches the threshold times the rate at the mean SNR above
-    the threshold.
+    It is the probability that the SNR reaches the threshold (that of links or of detection, the
+    higher one) times the rate at the mean SNR above it; 0 if the probability is 0.1 % or less.
     """
     value = np.empty(mission.snr_db.shape, np.float32)
     least_db = max(mission.threshold_db, mission.detection_db)
@@ -302,9 +302,10 @@ def next_action(mission: Mission, uav: int, row: int, column: int, battery: int,
                 count: int, reached: int, hovered: int, mask: np.ndarray) -> tuple[int, int, int]:
     """Return the next action of a UAV that follows a tour, and the new `reached` and `hovered`.
 
-    At the tour's end, or if the next waypoint is infeasible, the UAV hovers while it can, then
-    flies home. It has passed `reached` of the `count` waypoints of `tour` (W, 3), and hovered
-    `hovered` slots at the next one; `mask` (6,) is scratch.
+    A waypoint towards which no move is feasible is skipped, and so are hovers that the battery
+    does not allow. After the last waypoint the UAV hovers while it can, then flies home. It has
+    passed `reached` of the `count` waypoints of `tour` (W, 3), and hovered `hovered` slots at the
+    next one; `mask` (6,) is scratch.
     """
     feasible(mission, uav, row, column, battery, mask)
     while reached < count:

@@ -137,7 +137,8 @@ class QNetworks:
         """Make one gradient step on the squared TD errors of recorded flights.
 
         They may be of an earlier map; features are computed by the present mission. Returned are
-        `loss`, `gradient_norm` and `mean_value` (mean of Q_tot).
+        `loss`, `gradient_norm` (before it is clipped to `MAX_GRADIENT_NORM`) and `mean_value` (mean
+        of Q_tot, or of the UAVs' action values without a mixer).
         """
         settings, batch = self.settings, self._batch(flights, mission)
         values, _ = self.agent(batch.observation, batch.last_action, batch.sizes)
@@ -326,8 +327,8 @@ class Trainer:
         """Fly `episodes` flights with exploration, and update the networks.
 
         Returns:
-            means of `train_ratio` (collected share) and of the entries of `QNetworks.update`;
-            `epsilon` and `learning_rate` at the end.
+            means of `train_ratio` (collected share) and of the entries of `QNetworks.update`, which
+            are missing until the memory holds a batch; `epsilon` and `learning_rate` at the end.
         """
         settings, ratios, losses = self.settings, [], []
         for start in range(0, episodes, settings.parallel):
@@ -380,7 +381,8 @@ class QMIX(Learner):
     """`--algorithm qmix`: train one replica of QMIX in one map after the other.
 
     After every block of `federate_every` episodes the present policy is evaluated in the map it is
-    trained in. The best policy so far, earlier rounds included, is the learner's policy.
+    trained in. The best policy so far, earlier rounds included, is the learner's policy; with
+    `selection_flights` 0 nothing is evaluated (`twin_ratio` is NaN), and it is the last one.
     """
 
     networks: Callable[..., QNetworks] = QNetworks
@@ -427,19 +429,22 @@ class QMIX(Learner):
 
     def _train(self, episodes: int) -> tuple[dict[str, float], dict[str, np.ndarray]]:
         """Train all replicas; return the mean of their records, and their weights (`_merged`)."""
-        records, each = self._trainers.call("train", episodes), self._trainers.call("weights")
+        records, weights = self._trainers.call("train", episodes), self._trainers.call("weights")
         for record in records:
             self.training.flights += episodes
             self.training.collected += episodes * record["train_ratio"]
         return {name: float(np.mean([record[name] for record in records]))
-                for name in records[0]}, self._merged(each)
+                for name in records[0]}, self._merged(weights)
 
     def _merged(self, weights: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
         """Return the weights with which the replicas continue, given those of each."""
         return weights[0]
 
     def _ratio(self, mission: Mission, agent: Agent) -> float:
-        """Return the mean share that an agent collects, with the same shadowing for all agents."""
+        """Return the mean share that an agent collects; NaN if `selection_flights` is 0.
+
+        The shadowing is the same for all agents; the flights are counted in `selection`.
+        """
         flights, seed = self.setup.settings.selection_flights, self.setup.run.seed
         if not flights:
             return np.nan

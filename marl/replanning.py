@@ -40,7 +40,8 @@ class ReplanPolicy:
         believed: the mission with the map and data that the UAVs assume.
         prior: prior of the belief; None: the map is fixed.
         linked: whether the UAVs always communicate; otherwise only in reach of each other.
-        every: slots between searches of `iterations` plans; `first_iterations` before take-off.
+        every: slots between searches of `iterations` plans (half of them without a link);
+            `first_iterations` before take-off.
         seed, rng: of the first plan, and of the searches in flight.
     """
 
@@ -150,9 +151,10 @@ class ReplanPolicy:
                                            steps_home=self._mission.steps_home[v:v + 1])
             course = expected_flight(start, self._value[v:v + 1], tour[0][None],
                                      np.array([tour[1]]))
-            now = min(self._slot - slot, len(course.cell) - 1)
-            cells[v], batteries[v] = course.cell[now, 0], course.battery[now, 0]
-            tours[v] = _remaining(*tour, int(course.reached[now, 0]), int(course.hovered[now, 0]))
+            elapsed = min(self._slot - slot, len(course.cell) - 1)
+            cells[v], batteries[v] = course.cell[elapsed, 0], course.battery[elapsed, 0]
+            tours[v] = _remaining(*tour, int(course.reached[elapsed, 0]),
+                                  int(course.hovered[elapsed, 0]))
         return cells, batteries, tours
 
     def _left(self, knowledge: "_Knowledge") -> np.ndarray:
@@ -192,7 +194,8 @@ class _Knowledge:
     Attributes:
         belief: belief of the map; None: the map is fixed.
         seen: (K,) data left at each device when seen last; at first, those of the mission.
-        seen_in: (K,) slot in which they were seen; 0: never.
+        seen_in: (K,) slot in which they were seen; 0: never, or in the first slot, which other
+            UAVs do not learn.
         others: slot, cell, battery and remaining tour of each UAV when it was met last.
     """
 
@@ -203,7 +206,7 @@ class _Knowledge:
         self.seen = mission.data_units.copy()
         self.seen_in = np.zeros(mission.devices, dtype=np.int64)
         self.others: dict[int, tuple[int, np.ndarray, int, tuple[np.ndarray, int]]] = {}
-        # UAV -> what it heard: slot, cell, SNR; and how much of another's it has got
+        # UAV -> those of its readings that are known: slot, cell (2,), SNR (K,) [dB]
         self._readings: dict[int, list[tuple[int, np.ndarray, np.ndarray]]] = {
             u: [] for u in range(mission.uavs)}
 
@@ -255,10 +258,11 @@ class BeliefPlanner(Learner):
 
 
 def weighted(belief: Belief, data_units: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Multiply the data (K,) left at devices by the probability that they transmit, for planning.
+    """Weight data left (K,) and rates by the probability that devices transmit, for planning.
 
     Returns:
-        (K,) expected data, and (U, K, ny, nx) expected data of a slot on each link.
+        (K,) expected data left, and (U, K, ny, nx) expected data of a slot on each link, both
+        multiplied by the probability.
     """
     transmits = 1.0 - belief.silent
     return data_units * transmits, belief.expected_data() * transmits[None, :, None, None]

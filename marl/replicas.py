@@ -89,7 +89,7 @@ class Replicas:
             raise
 
     def call(self, method: str, *arguments: Any, each: list | None = None) -> list:
-        """Call a method of all trainers in parallel; `each` has a further argument for each.
+        """Call a method of all trainers in parallel; `each` lists one further argument a trainer.
 
         Raises:
             RunFailed: a process has ended.
@@ -97,10 +97,10 @@ class Replicas:
         given = [arguments] * len(self._local or self._pools) if each is None else \
             [(*arguments, one) for one in each]
         if self._local:
-            return [getattr(trainer, method)(*own) for trainer, own in zip(self._local, given)]
+            return [getattr(trainer, method)(*args) for trainer, args in zip(self._local, given)]
         for begun in self._begun:
             result_of(begun)
-        calls = [pool.submit(_call, method, own) for pool, own in zip(self._pools, given)]
+        calls = [pool.submit(_call, method, args) for pool, args in zip(self._pools, given)]
         return [result_of(call) for call in calls]
 
     def close(self) -> None:

@@ -175,7 +175,8 @@ class Session:
         best = self._baseline("planner", known, known, NO_FLIGHTS) | {
             "method": "clairvoyant", "trained_in": TRAINED_IN["truth"]}
         table = pd.DataFrame([*entries, best])
-        # Regret: data that the clairvoyant plan would have collected in addition on real flights.
+        # Regret [flights' data]: sum over real flights of the clairvoyant share minus their own;
+        # 0 without real flights, NaN if their share is not known.
         table["regret"] = (table["real_episodes"] * (best["truth_ratio"] - table["real_ratio"])
                            ).where(table["real_episodes"] > 0, 0.0)
         with atomic_path(self.out / "comparison.csv") as temporary:

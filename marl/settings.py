@@ -44,7 +44,7 @@ Settings = TypeVar("Settings", bound=BaseModel)
 
 
 def learners() -> dict[str, Any]:
-    """Return `LEARNERS` and the learners of installed packages."""
+    """Return `LEARNERS` and installed packages' learners, without those of a name in `LEARNERS`."""
     others = {point.name: point.value for point in entry_points("radiotwin.learners")}
     return LEARNERS | {name: value for name, value in others.items() if name not in LEARNERS}
 

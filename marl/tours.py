@@ -9,7 +9,9 @@ from radiotwin.runtime.compiled import njit
 def change(tour: np.ndarray, count: np.ndarray, only: int, level: np.ndarray, peaks: np.ndarray,
            left: np.ndarray, rows: int, columns: int, rng: np.random.Generator,
            changed: np.ndarray, first: np.ndarray) -> int:
-    """Change one tour, or two, at random in place; return how many have changed.
+    """Change one tour, or two, at random in place; return how many may have changed.
+
+    A change that does not fit is abandoned: then 1 is returned, and no tour has changed.
 
     `tour` (U, W, 3) and `count` (U,) are as in `marl.planner.Plan`; `only` is the UAV whose tour
     changes, -1 any. `peaks` (L, K, 2) are the cells where devices are heard best; those with much

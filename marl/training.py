@@ -123,8 +123,8 @@ class Batch:
         last_action: (N, U) int64, of the slot before; -1 in the first one.
         reward: (T, E, 1), not packed.
         valid: (T, E, 1), 0 behind the end of a flight.
-        slot: (N,) of each row.
-        flight: (N,) likewise.
+        slot: (N,) slot of each row.
+        flight: (N,) flight of each row, an index of `reward` and `valid`: the longest flight is 0.
         sizes: (T,) int64 flights that reach each slot, on the CPU.
     """
 

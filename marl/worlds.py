@@ -15,7 +15,7 @@ from radiotwin.twin import Twin
 from radiotwin.twin.shadowing import ErrorCorrelation
 
 CANDIDATES, CANDIDATES_ALONG_PATHS = 120, 12  # positions of a device; paths take seconds for each
-MAX_VALUES = 2e8  # largest number of values in the candidates' maps: 1.6 GB
+MAX_VALUES = 2e8  # most values in the candidates' two maps (0.8 GB), unless one needs more
 RADIUS_IN_SD = np.sqrt(2 * np.log(10))  # 90 % radius of a circular normal distribution [sd]
 MAX_TRIES = 50  # draws until all positions are outside buildings
 
@@ -65,9 +65,11 @@ def twin_prior(twin: Twin, scene: Scene, radio_map: RadioMap, rng: np.random.Gen
 
 def draw_positions(twin: Twin, row: int, scene: Scene, count: int,
                    rng: np.random.Generator) -> np.ndarray:
-    """Draw positions (count, 3) of a twin's device outside buildings [m]; zeros for row -1.
+    """Draw positions (count, 3) of a twin's device [m]; zeros for row -1.
 
-    They follow the credible radius, or are uniform if the device was not located.
+    They are normal with the 90 % credible radius, or uniform in the extent if the device was not
+    located. Draws inside buildings or outside the extent are repeated up to `MAX_TRIES` times; if
+    all fail, they are returned. Without a radius (an anchor) all are the device's position.
     """
     if row < 0:
         return np.zeros((count, 3))

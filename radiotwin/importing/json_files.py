@@ -95,8 +95,8 @@ class _Table:
             yield flat, False
         for name, items in receptions:
             for item in items:
-                for own, _ in self._rows(item, f"{name}."):
-                    yield flat | own, True
+                for reception, _ in self._rows(item, f"{name}."):
+                    yield flat | reception, True
 
     def _flatten(self, value: dict[str, Any], prefix: str, flat: dict[str, str],
                  receptions: list[tuple[str, list[Any]]]) -> None:

@@ -89,10 +89,12 @@ def list_files(paths: Iterable[Path | str],
                without: Iterable[Path | str]) -> tuple[list[LogFile], int]:
     """List the files to import, by name in each folder (with those in it) and zip file.
 
-    Files and folders of `without` are skipped, such as tables of positions and the output.
+    Files and folders of `without` are skipped, such as tables of positions and the output, and so
+    are hidden ones (`.name`, `__MACOSX` of a zip file).
 
     Returns:
-        the files, and the number of files of other formats in folders and zip files.
+        the files, and the number of others in folders and zip files: those of other formats, and
+        `.parquet` and `.xlsx` in a zip file, which cannot be read there.
 
     Raises:
         BadInput: a path cannot be read, or there are none or too many files.

@@ -338,7 +338,8 @@ def _far_notes(source: Source, links: pd.DataFrame, receivers: pd.DataFrame,
 def _split_by_band(links: pd.DataFrame) -> tuple[pd.DataFrame, dict[str, str], list[str]]:
     """Split devices that are read on carriers of several bands, whose levels and antennas differ.
 
-    Channels of one band stay one device. Returned are the links, new -> old name, and a note.
+    Channels of one band stay one device; readings without a carrier keep the old name. Returned
+    are the links, new -> old name, and a note.
     """
     if "frequency_hz" not in links:
         return links, {}, []

@@ -72,7 +72,8 @@ def build_links(source: Source, settings: Settings, tally: Tally, problems: Prob
 
     Returns:
         links in the order of the file, with the index of the source, and the number of readings per
-        row. Columns: `device, receiver, flight, level_db`; if given, `QUANTITIES` and `device_` +
+        row. With a column `snr`, an SNR below 0 dB is added to the level. Columns: `device,
+        receiver, flight, level_db` [dB or dBm]; if given, `QUANTITIES` and `device_` +
         `QUANTITIES` [deg, m], and `time_s, heading_deg, pitch_deg, roll_deg, quality,
         frequency_hz`.
     """
@@ -485,9 +486,10 @@ def _renumbered(source: Source, first: int, prefix: str) -> Source:
 
 
 def _drop_truncated_rows(source: Source, settings: Settings) -> Source:
-    """Drop rows that were cut off before the last used column; BadInput if there are many.
+    """Drop rows cut off before the last of `settings.columns`; BadInput if there are many.
 
-    Short rows with all used columns stay: programs omit empty last cells. But the only row of its
+    Short rows with all these columns stay, with a note: programs omit empty last cells. Columns of
+    `wide` do not count: the missing cells of a short row are read as empty. But the only row of its
     length, if it ends with a used column, may be cut off within that cell.
     """
     header = list(map(str, source.table))

@@ -290,7 +290,10 @@ def import_measurements(paths: Path | str | Sequence[Path | str], out: Path | st
 
 def _filtered(source: Source, positioned: PositionedLinks, settings: Settings,
               tally: Tally) -> PositionedLinks:
-    """Drop links outside the ranges of distance and level in the settings; unknown values pass."""
+    """Drop links outside the ranges of distance and level in the settings; unknown values pass.
+
+    The distance is in 3D [m]; a difference of unknown heights counts as 0.
+    """
     links = positioned.links
     distance_m: Any = None
     level_db = links["level_db"].to_numpy()

@@ -101,7 +101,12 @@ def seconds(source: Source, spec: str, time_format: str | None, zone: str | None
 
 def past_midnights(source: Source, spec: str, time_s: np.ndarray,
                    ends: Callable[[], np.ndarray]) -> tuple[np.ndarray, str]:
-    """Add a day after each midnight if the date is a constant; else note clocks that go back."""
+    """Add a day after each midnight if the date is a constant; else note clocks that go back.
+
+    A clock goes back if a time (n,) [s] is more than `BACK_S` before that of the previous row with
+    equal `ends()`, an (n,) label of device and receiver; a midnight is a step of `HALF_DAY_S` or
+    more. With more than `MAX_STEPS_BACK` steps the rows are unsorted: nothing is added or noted.
+    """
     known = np.flatnonzero(np.isfinite(time_s))
     step_s = np.diff(time_s[known])
     falls = step_s < -BACK_S
@@ -264,7 +269,10 @@ def in_metres(numbers: np.ndarray, unit: str | None, column: str) -> np.ndarray:
 
 def read_levels(source: Source, spec: str, settings: Settings,
                 offset_db: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Read the levels of one column [dB or dBm], and add an offset [dB], one for all or (n,).
+    """Read the levels of one column as dB or dBm, and add an offset [dB], one for all or (n,).
+
+    Milliwatts and watts become dBm; path losses become gains (their sign changes). The limit
+    `not_detected_at_or_below` is compared before, in the file's unit.
 
     Returns:
         levels (n,), NaN: not detected, or not to be used; and the reason for the latter (n,): `not
@@ -313,7 +321,8 @@ def read_levels(source: Source, spec: str, settings: Settings,
 def _refuse_uncalibrated(source: Source, spec: str, db: np.ndarray, high_db: float) -> None:
     """Raise BadInput if many levels (n,) [dB] are `high_db` or more, as of no calibrated receiver.
 
-    One or two different values with a gap to the others pass: they are a code for "no reading".
+    They pass, as codes for "no reading", if they are at most `MAX_OVER` of all, fewer than
+    `MIN_OVER` different values, or more than `MAX_GAP_DB` above the rest, or if there is no rest.
     """
     over = np.unique(db[db >= high_db])
     share = float(np.mean(db >= high_db)) if len(db) else 0.0

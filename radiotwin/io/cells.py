@@ -285,7 +285,11 @@ def as_numbers(text: pd.Series) -> np.ndarray:
 
 
 def as_text(cells: pd.Series) -> pd.Series:
-    """Convert cells (n,) of any type to stripped texts; whole numbers get no point, NaN is `""`."""
+    """Convert cells (n,) of any type to stripped texts; `""`: no value.
+
+    NaN and the words in `EMPTY`, in upper or lower case (`NA`, `none`), have no value. A column of
+    whole numbers gets no decimal points; one with any fraction keeps them all.
+    """
     if cells.dtype.kind == "f":
         whole = (cells == cells.round()) & (cells.abs() < 2.0**53)  # exact in double precision
         if (cells.isna() | whole).all():  # an integer column with gaps

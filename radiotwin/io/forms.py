@@ -12,8 +12,8 @@ from radiotwin.io.budgets import ENTRIES, NESTING, RECORD_BYTES
 from radiotwin.io.inputs import parse_json, read_text
 
 MAX_COORDINATE_M = 1e6
-MAX_POSITION_M = 1e7  # of what was measured: a quarter of a meridian
-"""Of the local frame [m]: beyond, single precision is coarser than a decimetre."""
+"""Largest declared coordinate of the local frame: beyond, float32 is coarser than a decimetre."""
+MAX_POSITION_M = 1e7  # largest measured coordinate: a quarter of a meridian
 Number = Annotated[float, Strict()]
 """A finite number; an integer is accepted, `true` and texts are not."""
 Metres = Annotated[Number, Field(ge=-MAX_COORDINATE_M, le=MAX_COORDINATE_M)]

@@ -59,7 +59,9 @@ MAX_WORKERS = 10_000
 class Executor:
     """Runs jobs in this process, or on the workers of a pool.
 
-    Results are the same to the bit, and in the order of the pieces, wherever they were computed.
+    Results are in the order of the pieces, and the same to the bit wherever they were computed,
+    except those of a piece that was done in halves after its worker died (`Job.halve`): a warning
+    says so.
 
     Args:
         pool: of workers; None: this process.
@@ -133,9 +135,10 @@ class Executor:
 
     def _run_here(self, job: Job, todo: "deque[_Todo]", cache: Cache,
                   advance: Callable[..., None], patience_s: float) -> None:
-        """Run pieces in this process, and remove them from `todo`, until `patience_s` is exceeded.
+        """Run pieces of `todo` in this process, and remove them, until it would take too long.
 
-        It is by the time so far, or by that of the rest at the same speed.
+        That is if the time so far, or the extrapolated time of the pieces left (by the mean of all
+        but the first), exceeds `patience_s` [s]. Without a pool all are run.
         """
         first_s = total_s = 0.0
         done = 0

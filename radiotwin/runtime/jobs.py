@@ -155,7 +155,10 @@ def thread_variables(cores: int) -> dict[str, str]:
 
 @contextmanager
 def _noted(outcome: Outcome) -> Iterator[None]:
-    """Add the user warnings and log records of a `with` block to the messages of `outcome`."""
+    """Add the block's UserWarnings (no subclasses) to `messages`, log records to `records`.
+
+    Both are of `outcome`. Records count from the level WARNING; warnings are lost on an error.
+    """
     handler = _Noting(outcome)
     root = logging.getLogger()
     root.addHandler(handler)

@@ -97,7 +97,10 @@ class PieceStore:
         return value
 
     def put(self, name: str, piece: Piece, messages: list[str]) -> None:
-        """Write a part (a cached result) to a file; on failure, warn once and write no more."""
+        """Write a part (a cached result) to a file; on failure, warn once and write no more.
+
+        A part larger than `PIECE_BYTES` is not written, without a warning.
+        """
         if self.failed:
             return
         data = _encode(piece[0], [piece[1], messages])

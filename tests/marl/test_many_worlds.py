@@ -1,8 +1,10 @@
 """Flights side by side, each in a world of its own: the same as one environment for each."""
 
 import numpy as np
+import pytest
 
 from marl.environment import Environment, ManyWorlds, observe
+from radiotwin.errors import BadInput
 from studies.generated import redrawn
 
 
@@ -30,3 +32,8 @@ def test_many_worlds_are_as_many_environments(city):
             for one, other in zip(worlds.frames[world], each.frame):
                 np.testing.assert_array_equal(one, other)
     assert not worlds.battery.any()
+
+
+def test_a_mission_whose_shadowing_lasts_is_refused(city):
+    with pytest.raises(BadInput, match="shadowing_share = 0.5"):
+        ManyWorlds([redrawn(city, np.random.default_rng(0))._replace(shadowing_share=0.5)], 5, np.random.default_rng(0))

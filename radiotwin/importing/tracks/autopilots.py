@@ -53,11 +53,11 @@ _TOPICS = ["vehicle_global_position", *_GPS, "vehicle_attitude"]
 
 
 def read_dataflash(path: Path) -> Fixes:
-    """Read positions and attitude from a DataFlash log, binary or text; BadInput without GPS."""
+    """Read 3D fixes of the first GPS receiver, and attitude, from a DataFlash log; or BadInput."""
     content = read_bytes(path, "flight log of ArduPilot")
     is_text = content[:4] == b"FMT,"
-    gps: list[list[float]] = []  # since start, week, since its start, place
-    attitude: list[list[float]] = []  # since start, roll, pitch, yaw
+    gps: list[list[float]] = []  # since boot [s], GPS week, time of week [s], lat, lon, altitude
+    attitude: list[list[float]] = []  # since boot [s], roll, pitch, yaw [deg]
     for name, fields in _text_messages(content) if is_text else _messages(content):
         clock_s = fields.get("TimeUS", fields.get("TimeMS", math.nan) * 1e3) / 1e6
         if name == "ATT":
@@ -82,7 +82,10 @@ def read_dataflash(path: Path) -> Fixes:
 
 
 def _nearest(attitude: np.ndarray, clock_s: np.ndarray) -> dict[str, np.ndarray]:
-    """Return roll, pitch and yaw (n,) [deg] at the nearest times, of rows (m, 4): time, angles."""
+    """Return roll, pitch and yaw (n,) [deg] at the nearest time, however far, of rows (m, 4).
+
+    A row is time [s], roll, pitch, yaw.
+    """
     if not len(attitude):
         return {}
     after = np.searchsorted(attitude[:, 0], clock_s).clip(0, len(attitude) - 1)

@@ -31,7 +31,8 @@ class Fixes:
         """Interpolate positions and angles at times (m,) [s since 1970 UTC].
 
         Returns:
-            column -> (m,); NaN if the neighbouring positions are more than `max_gap_s` apart.
+            column -> (m,); NaN before the first and after the last position, between positions
+            more than `max_gap_s` [s] apart, and where one of both values is unknown.
         """
         after = np.searchsorted(self.time_s, time_s).clip(1, max(len(self.time_s) - 1, 1))
         before = after - 1

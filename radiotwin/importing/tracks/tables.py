@@ -64,7 +64,11 @@ def _find(header: list[str], quantity: str, unit: str | None = None) -> str | No
 
 
 def read_track_table(path: Path, track: TrackFile, zone: str | None) -> Fixes:
-    """Read a table of positions over time; `zone` is that of times without an own one or an offset.
+    """Read a table of positions over time.
+
+    `zone` is the time zone of times without an offset if the track declares none; None: UTC, but
+    BadInput for a column of local time, or a date and an hour in two columns. The unit in the name
+    of an altitude column counts before the track's `length_unit`, then metres.
 
     Raises:
         BadInput: no column of time, latitude or longitude, or cells that cannot be read.

@@ -282,10 +282,13 @@ def _part(value: object, name: str) -> dict[str, Any]:
 
 
 def read_geojson(path: Path) -> Fixes | None:
-    """Read the tracks of a GeoJSON file: lines with a time at each point; None if it has none.
+    """Read the tracks of a GeoJSON file: lines with a time at each point; None without any line.
+
+    Lines of a MultiLineString without a list of times are left out.
 
     Raises:
-        BadInput: a line has another number of times than of positions.
+        BadInput: a LineString has no times, a line has another number of times than of positions,
+            or fewer than two positions have a time.
     """
     with open_gzip(path, "GeoJSON file", DOCUMENT_BYTES) as file:
         text = file.read()
