@@ -209,8 +209,8 @@ class Campaign:
             assert self.reality is not None and learner is not None
             self.reality.fly(self.measuring_policy(learner, rng), self.known)
             measured = self.reality.measurements()
-        self._see(fit_twin(measured, self.scene, model=TWINS[run.twin], seed=run.seed,
-                           start=self.twin))
+        self._set_twin(fit_twin(measured, self.scene, model=TWINS[run.twin], seed=run.seed,
+                                start=self.twin))
         self.learn_s = time.perf_counter() - started
 
     def measuring_policy(self, learner: Learner, rng: np.random.Generator) -> Policy:
@@ -295,9 +295,9 @@ class Campaign:
             self.reality.tables += require_tables(tables, self.scene)
             self.reality.ratios += ratios
         if state["twin"] is not None:
-            self._see(stored_twin(state["twin"], path, self.scene))
+            self._set_twin(stored_twin(state["twin"], path, self.scene))
 
-    def _see(self, twin: Twin) -> None:
+    def _set_twin(self, twin: Twin) -> None:
         """Set the twin, and the device positions that the UAVs know by it."""
         self.twin = twin
         if not self._true_positions:

@@ -37,15 +37,15 @@ def gru(x: Tensor, sizes: np.ndarray, memory: Tensor | None,
     """
     if x.device.type != "cpu":
         packed = PackedSequence(x, torch.from_numpy(sizes))
-        walked = unit(packed, None if memory is None else memory[None])[0].data
+        hidden_states = unit(packed, None if memory is None else memory[None])[0].data
     else:
         start = x.new_zeros(int(sizes[0]), unit.hidden_size) if memory is None else memory
-        walked = _Walk.apply(x, unit.weight_ih_l0, unit.weight_hh_l0, unit.bias_ih_l0,
+        hidden_states = _PackedGru.apply(x, unit.weight_ih_l0, unit.weight_hh_l0, unit.bias_ih_l0,
                              unit.bias_hh_l0, start, sizes)
-    return walked, walked[len(walked) - int(sizes[-1]):]
+    return hidden_states, hidden_states[len(hidden_states) - int(sizes[-1]):]
 
 
-class _Walk(torch.autograd.Function):
+class _PackedGru(torch.autograd.Function):
     """Differentiable map from inputs (N, inputs) to hidden states (N, H)."""
 
     @staticmethod
@@ -75,16 +75,16 @@ class _Walk(torch.autograd.Function):
         """See `torch.autograd.Function`."""
         x, weight, recurrent, memories = context.saved_tensors
         hidden = gradient.shape[1]
-        shares, context.work = context.work, None  # overwritten: there is no second backward pass
+        gate_gradients, context.work = context.work, None  # overwritten: only one backward pass
         before = torch.empty_like(gradient)
         _backward(gradient.contiguous().numpy(), recurrent.view(3, hidden, hidden).numpy(),
-                  memories.numpy(), shares.numpy(), before.numpy(), context.sizes)
-        of_x = shares[0] @ weight[:hidden]
+                  memories.numpy(), gate_gradients.numpy(), before.numpy(), context.sizes)
+        input_gradient = gate_gradients[0] @ weight[:hidden]
         for gate in (1, 2):
-            of_x.addmm_(shares[gate], weight[gate * hidden:(gate + 1) * hidden])
-        sums = shares.sum(1)
-        return (of_x, torch.cat([shares[gate].t() @ x for gate in (0, 1, 2)]),
-                torch.cat([shares[gate].t() @ before for gate in (0, 1, 3)]),
+            input_gradient.addmm_(gate_gradients[gate], weight[gate * hidden:(gate + 1) * hidden])
+        sums = gate_gradients.sum(1)
+        return (input_gradient, torch.cat([gate_gradients[gate].t() @ x for gate in (0, 1, 2)]),
+                torch.cat([gate_gradients[gate].t() @ before for gate in (0, 1, 3)]),
                 sums[:3].flatten(), sums[[0, 1, 3]].flatten(), None, None)
 
 
@@ -128,15 +128,15 @@ def _cell(r: np.ndarray, z: np.ndarray, n: np.ndarray, u: np.ndarray, r_h: np.nd
 def _forward(work: np.ndarray, recurrent: np.ndarray, n_bias: np.ndarray, memories: np.ndarray,
              sizes: np.ndarray) -> None:
     """Run all slots forwards: fill the gates in `work` and the hidden states in `memories`."""
-    share = np.empty((3, sizes[0], memories.shape[1]), np.float32)
+    from_memory = np.empty((3, sizes[0], memories.shape[1]), np.float32)
     before, first = 0, 0  # rows of the slot before in `memories`, and of this slot in `work`
     for size in sizes:
         rows, after = slice(first, first + size), sizes[0] + first
         memory = memories[before:before + size]
         for gate in range(3):
-            np.dot(memory, recurrent[gate], share[gate, :size])
-        _cell(work[0, rows], work[1, rows], work[2, rows], work[3, rows], share[0], share[1],
-              share[2], n_bias, memory, memories[after:after + size])
+            np.dot(memory, recurrent[gate], from_memory[gate, :size])
+        _cell(work[0, rows], work[1, rows], work[2, rows], work[3, rows], from_memory[0],
+              from_memory[1], from_memory[2], n_bias, memory, memories[after:after + size])
         before, first = after, first + size
 
 
@@ -151,11 +151,11 @@ def _cell_backward(gradient: np.ndarray, r: np.ndarray, z: np.ndarray, n: np.nda
         for i in range(before.shape[1]):
             r_bi, z_bi, n_bi = r[b, i], z[b, i], n[b, i]
             g = carried[b, i] + gradient[b, i]
-            of_n = g * (_ONE - z_bi) * (_ONE - n_bi * n_bi)
-            r[b, i] = of_n * u[b, i] * r_bi * (_ONE - r_bi)
+            n_gradient = g * (_ONE - z_bi) * (_ONE - n_bi * n_bi)
+            r[b, i] = n_gradient * u[b, i] * r_bi * (_ONE - r_bi)
             z[b, i] = g * (before[b, i] - n_bi) * z_bi * (_ONE - z_bi)
-            n[b, i] = of_n
-            u[b, i] = of_n * r_bi
+            n[b, i] = n_gradient
+            u[b, i] = n_gradient * r_bi
             carried[b, i] = g * z_bi
 
 
@@ -165,7 +165,7 @@ def _backward(gradient: np.ndarray, recurrent: np.ndarray, memories: np.ndarray,
     """Run all slots backwards: turn `work` into gradients, and fill `before` with prior states."""
     hidden = gradient.shape[1]
     carried = np.zeros((sizes[0], hidden), np.float32)
-    share = np.empty((3, sizes[0], hidden), np.float32)
+    from_memory = np.empty((3, sizes[0], hidden), np.float32)
     first = len(gradient)
     for t in range(len(sizes) - 1, -1, -1):
         size = sizes[t]
@@ -175,9 +175,9 @@ def _backward(gradient: np.ndarray, recurrent: np.ndarray, memories: np.ndarray,
         before[rows] = memories[start:start + size]
         _cell_backward(gradient[rows], work[0, rows], work[1, rows], work[2, rows], work[3, rows],
                        before[rows], carried)
-        np.dot(work[0, rows], recurrent[0], share[0, :size])
-        np.dot(work[1, rows], recurrent[1], share[1, :size])
-        np.dot(work[3, rows], recurrent[2], share[2, :size])
+        np.dot(work[0, rows], recurrent[0], from_memory[0, :size])
+        np.dot(work[1, rows], recurrent[1], from_memory[1, :size])
+        np.dot(work[3, rows], recurrent[2], from_memory[2, :size])
         for b in range(size):
             for i in range(hidden):
-                carried[b, i] += share[0, b, i] + share[1, b, i] + share[2, b, i]
+                carried[b, i] += from_memory[0, b, i] + from_memory[1, b, i] + from_memory[2, b, i]

@@ -88,7 +88,8 @@ class HarvestEnv(ParallelEnv[str, Arrays, int]):
         self._environment = Environment(self.mission, 1, self._rng)
         self._environment.reset()
         self.agents = self.possible_agents[:]
-        return self._seen(self.agents, replaced=np.zeros(self.mission.uavs, dtype=bool))
+        return self._observations_and_infos(
+            self.agents, replaced=np.zeros(self.mission.uavs, dtype=bool))
 
     def step(self, actions: dict[str, int]) -> tuple[
             dict[str, Arrays], dict[str, float], dict[str, bool], dict[str, bool],
@@ -104,15 +105,15 @@ class HarvestEnv(ParallelEnv[str, Arrays, int]):
         rewards = {agent: float(collected[number[agent]]) for agent in flying}
         terminations = {agent: bool(landed[number[agent]]) for agent in flying}
         self.agents = [agent for agent in flying if not terminations[agent]]
-        observations, infos = self._seen(flying, replaced=(action != wanted)[0])
+        observations, infos = self._observations_and_infos(flying, replaced=(action != wanted)[0])
         return observations, rewards, terminations, dict.fromkeys(flying, False), infos
 
     def state(self) -> np.ndarray:
         """Return the global state (state_size,) float32, see `marl.environment.global_state`."""
         return global_state(self.mission, self._environment.frame)[0]
 
-    def _seen(self, agents: list[str], replaced: np.ndarray,
-              ) -> tuple[dict[str, Arrays], dict[str, dict[str, Any]]]:
+    def _observations_and_infos(self, agents: list[str], replaced: np.ndarray,
+                                ) -> tuple[dict[str, Arrays], dict[str, dict[str, Any]]]:
         """Return observations and infos of agents; `replaced` (U,) marks infeasible actions."""
         observation, mask = observe(self.mission, self._environment.frame)
         observations, infos = {}, {}
@@ -167,29 +168,29 @@ class CentralVectorEnv(VectorEnv[Arrays, np.ndarray, np.ndarray]):
             self._np_random, self._np_random_seed = np.random.default_rng(seed), seed
         self._environment = Environment(self.mission, self.num_envs, self._np_random)
         self._environment.reset()
-        self._over = np.zeros(self.num_envs, dtype=bool)
-        return self._seen()
+        self._finished = np.zeros(self.num_envs, dtype=bool)
+        return self._observations_and_infos()
 
     def step(self, actions: np.ndarray,
              ) -> tuple[Arrays, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Fly one slot with actions (E, U), infeasible ones replaced; see Gymnasium."""
-        environment, anew = self._environment, self._over
-        wanted = np.where(anew[:, None], NO_OP, actions)
+        environment, restarts = self._environment, self._finished
+        wanted = np.where(restarts[:, None], NO_OP, actions)
         action = safe_actions(wanted, observe(self.mission, environment.frame)[1])
         reward = environment.step(action).sum(axis=1, dtype=float)
-        if anew.any():
-            environment.reset(anew)
-        self._over = environment.done
-        seen, infos = self._seen()
+        if restarts.any():
+            environment.reset(restarts)
+        self._finished = environment.done
+        seen, infos = self._observations_and_infos()
         infos["replaced"] = action != wanted
-        return seen, reward, self._over.copy(), np.zeros(self.num_envs, dtype=bool), infos
+        return seen, reward, self._finished.copy(), np.zeros(self.num_envs, dtype=bool), infos
 
     @property
     def frame(self) -> Frame:
         """Present state of all flights."""
         return self._environment.frame
 
-    def _seen(self) -> tuple[Arrays, dict[str, Any]]:
+    def _observations_and_infos(self) -> tuple[Arrays, dict[str, Any]]:
         """Return observations and infos of all flights."""
         frame = self.frame
         observation, mask = observe(self.mission, frame)

@@ -167,9 +167,9 @@ def make_mission(scene: Scene, radio_map: RadioMap, known: Known, assignment: st
         _check_values(device.device, "gain_db", gain_db, -MAX_GAIN_DB, MAX_GAIN_DB)
         snr_db[:, k] = np.where(np.isnan(gain_db), -np.inf, gain_db + offset_db[k])
         if "sigma_db" in radio_map.dataset:
-            own_db = radio_map.dataset["sigma_db"].values[row, used]
-            _check_values(device.device, "sigma_db", own_db, 0.0, MAX_SIGMA_DB)
-            sigma_db[:, k] = np.nan_to_num(own_db)
+            device_sigma_db = radio_map.dataset["sigma_db"].values[row, used]
+            _check_values(device.device, "sigma_db", device_sigma_db, 0.0, MAX_SIGMA_DB)
+            sigma_db[:, k] = np.nan_to_num(device_sigma_db)
     starts, homes = zip(*(_ends(scene, uav, ~keep_out[at])
                           for uav, at in zip(config.uavs, levels)))
     origin_m = np.array([lattice.x_m[0], lattice.y_m[0]])

@@ -81,7 +81,7 @@ class Session:
         world = _world(scene, truth)
         self._claim_folder(world)
         with ExitStack() as stack:
-            beside = self._begin_beside(stack)
+            compared = self._start_comparison(stack)
             advance = stack.enter_context(progress(
                 "first real episode", total=self.run.real_episodes * self.run.episodes, lines=True))
 
@@ -100,18 +100,18 @@ class Session:
                                  _Log(self.out), on_progress, device, on_learned)
             curves = {f"{self.run.algorithm} in {TRAINED_IN[self.run.twin]}": main.rows}
             entries = [_entry(self.run.algorithm, self.run.twin, main.rows[-1])]
-            for run, call in beside:
+            for run, call in compared:
                 _say_row(entries[-1])
                 advance(0, f"{TRAINED_IN[run.twin]}: the comparison is trained")
                 rows = result_of(call)
                 curves[f"{run.algorithm} in {TRAINED_IN[run.twin]}"] = rows
                 entries.append(_entry(run.algorithm, run.twin, rows[-1]))
         recorded = RECORDED.get(world["truth"])
-        if recorded and self.run.truth == "traced" and self.run.compare == "twins" and beside:
+        if recorded and self.run.truth == "traced" and self.run.compare == "twins" and compared:
             entries.append(recorded)
         return self._write(scene, truth, main, curves, entries), curves
 
-    def _begin_beside(self, stack: ExitStack) -> "list[tuple[RunSettings, Future[list[dict]]]]":
+    def _start_comparison(self, stack: ExitStack) -> "list[tuple[RunSettings, Future[list[dict]]]]":
         """Start the runs of the comparison, one after the other in a process of their own.
 
         FedQMIX is compared by a single replica of QMIX, which takes a third of the work. Returned

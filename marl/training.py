@@ -38,8 +38,8 @@ class Exploration:
         A random action is repeated for some slots, and ends early if it becomes infeasible.
         """
         begins = (self._rng.random(action.shape) < self._begin) & (self._left == 0)
-        lots = np.where(mask, self._rng.random(mask.shape), -1.0).argmax(axis=-1)
-        self._kept[begins] = lots[begins]
+        drawn = np.where(mask, self._rng.random(mask.shape), -1.0).argmax(axis=-1)
+        self._kept[begins] = drawn[begins]
         lengths = np.ones(action.shape, dtype=np.int64) if self._mean_slots == 1 else \
             self._rng.geometric(1 / self._mean_slots, action.shape)
         self._left[begins] = lengths[begins]

@@ -33,8 +33,8 @@ def twin_prior(twin: Twin, scene: Scene, radio_map: RadioMap, rng: np.random.Gen
     names = [device.device for device in scene.config.devices]
     row_of = {device.device: row for row, device in enumerate(twin.devices)}
     rows = np.array([row_of.get(name, -1) for name in names])
-    most = CANDIDATES_ALONG_PATHS if twin.channel.follows_paths else CANDIDATES
-    count = max(min(most, int(MAX_VALUES / (2 * len(names) * len(receiver_m)))), 1)
+    max_count = CANDIDATES_ALONG_PATHS if twin.channel.follows_paths else CANDIDATES
+    count = max(min(max_count, int(MAX_VALUES / (2 * len(names) * len(receiver_m)))), 1)
     drawn_m = np.stack([draw_positions(twin, row, scene, count, rng) for row in rows], axis=1)
     # Anchors have one candidate; devices without a position are drawn anywhere.
     moves = np.array([bool(np.ptp(drawn_m[:, k], axis=0).any()) for k in range(len(names))])
@@ -51,10 +51,10 @@ def twin_prior(twin: Twin, scene: Scene, radio_map: RadioMap, rng: np.random.Gen
         device_m = links.device_m.copy()
         device_m[rows[some]] = drawn_m[number, some]
         predicted = twin.predict(links.with_devices(device_m))
-        mean_db, own_sd_db = (values.reshape(len(some), *shape[2:])
+        mean_db, candidate_sd_db = (values.reshape(len(some), *shape[2:])
                               for values in (predicted.mean_db, predicted.sd_db))
         snr_db[some, number] = mean_db + offset_db[some, None, None, None]
-        sd_db[some, number] = own_sd_db
+        sd_db[some, number] = candidate_sd_db
     weight = np.where(moves[:, None], 1.0 / count, np.arange(count) == 0)
     # The level common to all devices is as uncertain as the mean of the measured devices.
     common_sd_db = errors.level_sd_db / np.sqrt(max(errors.devices, 1))
@@ -123,9 +123,9 @@ class WorldSource:
         transmits = rng.random(devices) >= prior.silent
         for k in range(devices):
             chosen = rng.choice(candidates, p=prior.weight[k])
-            own_sd_db = prior.sd_db[k, chosen]
-            snr_db[:, k] = prior.snr_db[k, chosen] + own_sd_db * lasting[k] + off_db[k]
-            sigma_db[:, k] = own_sd_db * np.sqrt(1 - prior.share)
+            candidate_sd_db = prior.sd_db[k, chosen]
+            snr_db[:, k] = prior.snr_db[k, chosen] + candidate_sd_db * lasting[k] + off_db[k]
+            sigma_db[:, k] = candidate_sd_db * np.sqrt(1 - prior.share)
         snr_db[:, ~transmits] = -np.inf
         spread = rng.uniform(1 - prior.data_spread, 1 + prior.data_spread, devices)
         return mission._replace(snr_db=snr_db, sigma_db=sigma_db, shadowing_share=0.0,

@@ -94,7 +94,7 @@ class Executor:
             if missing:
                 with progress(job.description, len(missing)) as advance:
                     try:
-                        self._run_there(job, missing, cache, advance)
+                        self._run_on_workers(job, missing, cache, advance)
                     except RunFailed as error:
                         self._say_once(f"{error}. It is done in this process")
 
@@ -128,12 +128,12 @@ class Executor:
             with progress(job.description, total=steps) as advance:
                 todo = deque(missing)
                 if not self._has_workers:
-                    self._run_here(job, todo, kept, advance, self._patience_s)
-                if todo and not self._run_there(job, todo, kept, advance):
-                    self._run_here(job, todo, kept, advance, math.inf)
+                    self._run_in_process(job, todo, kept, advance, self._patience_s)
+                if todo and not self._run_on_workers(job, todo, kept, advance):
+                    self._run_in_process(job, todo, kept, advance, math.inf)
         return results
 
-    def _run_here(self, job: Job, todo: "deque[_Todo]", cache: Cache,
+    def _run_in_process(self, job: Job, todo: "deque[_Todo]", cache: Cache,
                   advance: Callable[..., None], patience_s: float) -> None:
         """Run pieces of `todo` in this process, and remove them, until it would take too long.
 
@@ -153,7 +153,7 @@ class Executor:
             one.deliver(result)
             advance(job.size(one.piece))
 
-    def _run_there(self, job: Job, todo: "deque[_Todo]", cache: Cache,
+    def _run_on_workers(self, job: Job, todo: "deque[_Todo]", cache: Cache,
                    advance: Callable[..., None]) -> bool:
         """Run all pieces of `todo` on workers; return False, and run none, if the pool has none."""
         assert self._pool is not None

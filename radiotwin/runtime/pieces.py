@@ -70,7 +70,7 @@ class PieceStore:
     saved: int = 0
     failed: str = ""
     shown: set[str] = field(default_factory=set)
-    _own: set[str] = field(default_factory=set)
+    _written: set[str] = field(default_factory=set)
     _bytes: int | None = None
 
     @property
@@ -116,7 +116,7 @@ class PieceStore:
             return
         self.saved += 1
         note_finished()
-        self._own.add(name)
+        self._written.add(name)
         self._shrink(len(data))
 
     def files(self) -> list[tuple[float, int, Path]]:
@@ -286,7 +286,7 @@ class ResultCache(Generic[P, T]):
         if found is None:
             return None
         value, messages = found
-        if name not in store._own:
+        if name not in store._written:
             store.earlier += 1
             note_finished()
         for message in messages:

@@ -198,17 +198,17 @@ def _ros2_table_messages(path: Path) -> Iterator[BagMessage]:
 
 def _mcap_messages(path: Path) -> Iterator[BagMessage]:
     """Yield the position messages of an MCAP file, up to the last complete chunk."""
-    walk = _Walk(path)
+    reader = _McapReader(path)
     with open_input(path, "recording (.mcap)") as file:
         if file.read(len(_MCAP_MAGIC)) != _MCAP_MAGIC:
             raise BadInput(f"{path} is no MCAP file; fetch it again")
         try:
-            yield from walk.messages(file)
+            yield from reader.messages(file)
         except (struct.error, UnicodeDecodeError) as error:
             raise BadInput(f"{path} is damaged ({error}); fetch it again") from None
 
 
-class _Walk:
+class _McapReader:
     """Walk over the records of an MCAP file, with the channels of positions found so far."""
 
     def __init__(self, path: Path) -> None:
