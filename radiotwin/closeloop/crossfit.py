@@ -373,6 +373,15 @@ class CrossFit:
                     found |= (self.index == number) & term.acts
         return found
 
+    @cached_property
+    def learnable(self) -> np.ndarray:
+        """(n,) bool, links that other links tell: no fault or change lies between them."""
+        found = ~self.not_learnable
+        for number, fold in enumerate(self.folds):
+            for effect in self.whole.effects:
+                found &= (self.index != number) | ~effect.untold(self.links, fold.train)
+        return found
+
     def rmse_db(self, rows: np.ndarray | None = None) -> float:
         """Return the held-out RMSE of detected links in a mask (n,) [dB]; None: of all links."""
         return _rms(self.links.level_db - self.held_out_mean_db, rows)

@@ -280,6 +280,18 @@ class Effect(ABC):
         """
         return None
 
+    def untold(self, links: Links, train: np.ndarray) -> np.ndarray:
+        """Return (n,) bool, links whose levels no training link tells, though it shows the effect.
+
+        A receiver that changed between two flights is an example: if the last flight before the
+        change is held out, no link tells when it changed. By default none.
+
+        Args:
+            links: n links.
+            train: (n,) bool, links that a fold is fitted to.
+        """
+        return np.zeros(len(links), dtype=bool)
+
     def reading_offsets_db(self, coefficients: np.ndarray) -> dict[int, float]:
         """Return receiver index -> by how much the effect shifts all its readings [dB].
 

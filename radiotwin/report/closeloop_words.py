@@ -306,6 +306,8 @@ def _effect_words(report: dict) -> str:
             else f" (the same {error['before']['n']:,} links)")
     text = (f"{start}: {'; '.join(objects(report))}{sure}. With {it} the RMSE on held-out links "
             f"{goes}{of_links}.")
+    if error.get("learnable"):
+        text += _learnable_words(error)
     unnamed = _unnamed_beside(report)
     if unnamed is not None:
         text += (f" Beside {it} something is left that has no name (probability "
@@ -313,6 +315,17 @@ def _effect_words(report: dict) -> str:
     if report["remaining"]["drivers"]:
         text += f" The remaining residual depends on {join_names(drivers(report))}."
     return text
+
+
+def _learnable_words(error: dict) -> str:
+    """Give both RMSEs without the links of a fault or change that other flights do not show."""
+    both = error["learnable"]
+    count = error["before"]["n"] - both["before"]["n"]
+    if not count or not both["before"]["n"]:
+        return ""
+    before, after = (number(both[when]["rmse_db"]) for when in ("before", "after"))
+    return (f" {count:,} of these links lie at a fault or a change that other flights do not show; "
+            f"without them it is {before} dB before and {after} dB after.")
 
 
 def _unnamed_beside(report: dict) -> float | None:

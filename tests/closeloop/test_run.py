@@ -97,6 +97,9 @@ def test_what_was_done_to_a_world_is_named_and_measured(open_ground, seed, chang
         assert len(named(report)) == 1
     for name, (expected, within) in values.items():
         assert value(report, effect, name or parameter) == pytest.approx(expected, abs=within)
+    if "step_time_s[r1]" in values:  # the flights beside the change are told by no other
+        learnable = report["error"]["learnable"]
+        assert learnable["before"]["n"] == 3000 - 1 and learnable["after"]["rmse_db"] == pytest.approx(2.0, rel=0.06)
     if effect == "device_position_error":
         found_m = [value(report, effect, f"{axis}_m[d1]") for axis in "xy"]
         assert found_m == pytest.approx(position_m[1, :2], abs=10)

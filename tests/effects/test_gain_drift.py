@@ -98,3 +98,15 @@ def test_a_time_constant_is_refined_on_a_logarithmic_scale():
     changed = variation.effect(np.array([2.0])).params
     assert changed.receivers == {0: ("step", 90.0), 1: ("warm_up", float(np.exp(2.0)))}
     assert DeviceDrift().with_params(DeviceDrift.Params(devices={0: Drift("step", 90.0)})).variation() is None
+
+
+def test_which_links_no_other_flight_tells(make_links):
+    time_s = np.array([0.0, 100.0, 200.0, 300.0, 400.0, 200.0])
+    links = make_links([[0.0, 0, 1.5]], np.full((6, 3), 50.0), time_s=time_s, receiver=np.array([0, 0, 0, 0, 0, 1]),
+                       flight=np.arange(6), level_db=np.full(6, -80.0))
+    step = ReceiverDrift().with_params(ReceiverDrift.Params(receivers={0: Drift("step", 150.0)}))
+    for held_out, is_untold in ((0, False), (1, True), (2, True), (3, False), (5, False)):
+        assert step.untold(links, np.arange(6) != held_out)[held_out] == is_untold
+    assert step.untold(links, time_s > 150).tolist() == [True, True, False, False, False, False]
+    ageing = ReceiverDrift().with_params(ReceiverDrift.Params(receivers={0: Drift("ageing", 150.0)}))
+    assert not ageing.untold(links, np.zeros(6, dtype=bool)).any()

@@ -115,6 +115,10 @@ def make_report(loop: Loop) -> dict[str, Any]:
     both = np.isfinite(loop.before.on_map[0]) & np.isfinite(links.level_db)
     if error["before"]["n"] != error["after"]["n"]:  # a device could be located only afterwards
         error["after_same_links"] = scores(loop.after, both)
+    learnable = loop.after.learnable
+    if not learnable.all():
+        error["learnable"] = {when: scores(model, both & learnable) for when, model in
+                              (("before", loop.before), ("after", loop.after))}
     if loop.after.reads_quality:
         error["after_with_quality"] = _scores(links.level_db, loop.after.held_out_mean_db,
                                               loop.after.held_out_nll)

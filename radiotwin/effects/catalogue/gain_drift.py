@@ -94,6 +94,24 @@ class _GainDrift(GainEffect):
     def between_flights(self) -> Effect:
         return type(self)(between_flights=True)
 
+    @override
+    def untold(self, links: Links, train: np.ndarray) -> np.ndarray:
+        """Return (n,) bool, links between which and the step, or warm-up, none is learnt from.
+
+        A warm-up counts as a change at its time constant, when two thirds of it are over.
+        """
+        found = np.zeros(len(links), dtype=bool)
+        for member, (form, number) in self.drifts().items():
+            if form not in ("step", "warm_up"):  # others show in every flight
+                continue
+            when_s = number + (links.first_s if form == "warm_up" else 0.0)
+            of_member = (self.index(links) == member) & np.isfinite(links.time_s)
+            learnt_s = np.sort(links.time_s[of_member & train & np.isfinite(links.level_db)])
+            first = np.searchsorted(learnt_s, np.minimum(links.time_s, when_s), side="left")
+            last = np.searchsorted(learnt_s, np.maximum(links.time_s, when_s), side="right")
+            found |= of_member & (first == last)
+        return found
+
     def _members(self, links: Links) -> list[int]:
         """List the receivers, or devices, with enough links."""
         return frequent_labels(self.index(links)[np.isfinite(links.time_s)], MIN_LINKS)
