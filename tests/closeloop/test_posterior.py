@@ -8,6 +8,7 @@ from scipy.special import logsumexp
 
 from radiotwin.closeloop.search.trials import Trial
 from radiotwin.closeloop.verdict.criteria import SelectionCriteria
+from radiotwin.closeloop.verdict.hypotheses import Hypotheses
 from radiotwin.closeloop.verdict.posterior import NONE, OTHER, features, judge, probability_of
 from radiotwin.closeloop.verdict.sensitivity import needed_nats
 from radiotwin.effects.catalogue.clock_offset import ReceiverClockOffset
@@ -15,7 +16,7 @@ from radiotwin.effects.catalogue.gain_offsets import DeviceGainOffset, ReceiverG
 from radiotwin.effects.catalogue.position_errors import DevicePositionError
 from radiotwin.inference.correlated_evidence import Columns
 from radiotwin.twin.model.fitting import add_effect
-from tests.closeloop.looking import looked_at
+from tests.closeloop.looking import based, looked_at
 
 CRITERIA = SelectionCriteria()
 
@@ -71,7 +72,15 @@ def test_the_scatter_of_flights_is_learnt_and_what_all_share_is_none(open_ground
 
         found_db.append(sd_of_levels_db(looked_at(open_ground, seed, flights_differ)[1]))
     devices_db, _, tracks_db = np.sqrt(np.mean(np.square(found_db), axis=0))
-    assert 1.2 < tracks_db < 2.8 and devices_db < 0.6
+    assert 1.0 < tracks_db < 3.0 and devices_db < 0.6  # robust, and drawn to 0.5 dB
+
+
+@pytest.mark.seconds
+def test_with_many_tracks_the_scatter_of_flights_is_learnt(open_ground):
+    world = open_ground.fly(0, flights=24, slots=20)
+    world.gain_db += scattered(world.flight, 3.0, np.random.default_rng(0))
+    hypotheses = Hypotheses.of(based(open_ground.measured(world))[0].whole, 0)
+    assert 1.8 < hypotheses.nuisance.prior_sd[-1] < 4.2 and len(set(hypotheses.nuisance.prior_sd[-24:])) == 1
 
 
 def test_the_scatter_of_devices_is_learnt(open_ground):

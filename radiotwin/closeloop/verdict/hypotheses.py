@@ -316,12 +316,12 @@ def _clip_outliers(z: np.ndarray, near: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class _Family:
-    """Levels of k ends of one kind: devices, receivers, or tracks.
+    """Levels of k ends of one kind: devices, receivers, and tracks or flights.
 
     Attributes:
         columns: their columns in the nuisance.
         group: (k,) receiver of a track, about whose level its tracks scatter; else 0.
-        start_s: (k,) time at which a track begins [s]; NaN for other ends, or if unknown.
+        start_s: (k,) time at which a track or flight begins [s]; NaN for others, or if unknown.
     """
 
     columns: slice
@@ -364,7 +364,7 @@ def _nuisance(links: Links, mean_db: np.ndarray) -> tuple[Columns, list[_Family]
 
     They are a level and a distance slope of LoS and of NLoS links, a curve over elevation and over
     the predicted `mean_db` (n,), as weak links arrive by paths that the base omits, and a level of
-    each device, receiver and track (flight of a receiver).
+    each device, receiver and track (flight of a receiver), or flight if tracks are too many.
 
     Returns:
         the columns with prior sds, and the families of columns of the last three kinds.
@@ -378,16 +378,19 @@ def _nuisance(links: Links, mean_db: np.ndarray) -> tuple[Columns, list[_Family]
     for values in (mean_db, links.elevation_deg):
         blocks.append(curve_columns(values, CURVE_KNOTS, circular=False))
         prior_sd_db += [NUISANCE_SD_DB] * blocks[-1].shape[1]
-    for label in (links.device, links.receiver, links.track):
+    by_track = len(np.unique(links.track)) <= MAX_ENDS
+    in_time = links.track if by_track else links.flight
+    for label in (links.device, links.receiver, in_time):
         members, first = np.unique(label, return_index=True)
         if 1 < len(members) <= MAX_ENDS:
             blocks.append(one_hot(label, members.tolist()))
             columns = slice(len(prior_sd_db), len(prior_sd_db) + len(members))
-            is_track = label is links.track
-            families.append(_Family(columns,
-                                    links.receiver[first] if is_track else np.zeros(len(members)),
-                                    links.time_s[first] if is_track and not links.time_restarts
-                                    else np.full(len(members), np.nan)))
+            group, start_s = np.zeros(len(members)), np.full(len(members), np.nan)
+            if label is in_time and by_track:
+                group = links.receiver[first]
+            if label is in_time and not links.time_restarts:
+                start_s = links.time_s[first]
+            families.append(_Family(columns, group, start_s))
             prior_sd_db += [SPREAD_DB] * len(members)
     return Columns(np.hstack(blocks), np.array(prior_sd_db)), families
 
