@@ -159,8 +159,8 @@ class CorrelatedField:
 
     def __init__(self, shape: tuple[int, int], step_m: float, length_m: float) -> None:
         self._shape = shape
-        # A torus that keeps opposite sides of the map three lengths apart (correlation 0.05), or
-        # one side of the map if that is shorter; then the correlation is only approximate.
+        # A torus that keeps opposite sides of the map three lengths apart (correlation 0.05 at
+        # most), or a whole side if that is shorter: then no distance is shorter the other way.
         around = [next_fast_len(side + min(side, int(np.ceil(3.0 * length_m / step_m))))
                   for side in shape]
         rows, columns = (np.minimum(np.arange(n), n - np.arange(n)) * step_m for n in around)

@@ -307,7 +307,7 @@ def _effect_words(report: dict) -> str:
     text = (f"{start}: {'; '.join(objects(report))}{sure}. With {it} the RMSE on held-out links "
             f"{goes}{of_links}.")
     if error.get("learnable"):
-        text += _learnable_words(error)
+        text += _learnable_words(error, interpolated)
     unnamed = _unnamed_beside(report)
     if unnamed is not None:
         text += (f" Beside {it} something is left that has no name (probability "
@@ -317,15 +317,19 @@ def _effect_words(report: dict) -> str:
     return text
 
 
-def _learnable_words(error: dict) -> str:
-    """Give both RMSEs without the links of a fault or change that other flights do not show."""
+def _learnable_words(error: dict, interpolated: bool) -> str:
+    """Give both RMSEs without links of a fault or change that only links held out with them show.
+
+    The one after may be that of a model that also interpolates.
+    """
     both = error["learnable"]
     count = error["before"]["n"] - both["before"]["n"]
     if not count or not both["before"]["n"]:
         return ""
     before, after = (number(both[when]["rmse_db"]) for when in ("before", "after"))
-    return (f" {count:,} of these links lie at a fault or a change that other flights do not show; "
-            f"without them it is {before} dB before and {after} dB after.")
+    end = ", with interpolation" if interpolated else ""
+    return (f" {count:,} of these links lie at a fault or a change that only links held out with "
+            f"them show; without them it is {before} dB before and {after} dB after{end}.")
 
 
 def _unnamed_beside(report: dict) -> float | None:

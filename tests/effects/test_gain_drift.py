@@ -108,5 +108,9 @@ def test_which_links_no_other_flight_tells(make_links):
     for held_out, is_untold in ((0, False), (1, True), (2, True), (3, False), (5, False)):
         assert step.untold(links, np.arange(6) != held_out)[held_out] == is_untold
     assert step.untold(links, time_s > 150).tolist() == [True, True, False, False, False, False]
+    blank = links.with_columns(level_db=np.where(np.arange(6) == 2, np.nan, -80.0))
+    assert step.untold(blank, np.arange(6) != 3)[3], "a blank tells nothing"
+    warming = ReceiverDrift().with_params(ReceiverDrift.Params(receivers={0: Drift("warm_up", 40.0)}))
+    assert warming.untold(links, np.arange(6) != 0).tolist() == [True, False, False, False, False, False]
     ageing = ReceiverDrift().with_params(ReceiverDrift.Params(receivers={0: Drift("ageing", 150.0)}))
     assert not ageing.untold(links, np.zeros(6, dtype=bool)).any()

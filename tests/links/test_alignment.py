@@ -1,6 +1,7 @@
 """Measurements and scene in one frame: converted, refused with the translation that fits, or told to be the same."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -119,9 +120,13 @@ def test_a_ride_with_gps_errors_is_in_the_frame(rbm):
         in_scene_frame(measured(receiver_m + [60.0, 0.0, 0.0]), rbm)
 
 
+@pytest.mark.parametrize(("terrain", "z_m"), [(None, 25.0), ("a hill", 425.0)])
 @pytest.mark.parametrize("with_map", [True, False])
-def test_heights_above_the_ground_count_in_an_object_as_in_a_table(rbm, with_map):
+def test_heights_above_the_ground_count_in_an_object_as_in_a_table(rbm, with_map, terrain, z_m):
+    city = SimpleNamespace(terrain=terrain, ground_height_m=lambda x_m, y_m: np.full(len(x_m), 400.0))
+    scene = SimpleNamespace(config=rbm.config, city=city) if with_map else None
     table = measured(walked(rbm, 0, 30)).table.drop(columns="receiver_z_m").assign(receiver_above_ground_m=25.0)
     devices = measured(np.zeros((1, 3))).devices
-    taken = as_measurements(Measurements(table, devices), rbm if with_map else None)
-    assert (taken.receiver_m[:, 2] == 25.0).all() and "receiver_above_ground_m" not in taken.table
+    taken = as_measurements(Measurements(table, devices), scene)
+    assert (taken.receiver_m[:, 2] == (z_m if with_map else 25.0)).all()
+    assert "receiver_above_ground_m" not in taken.table

@@ -153,7 +153,7 @@ SAID = [  # a report, what its page says, and what it does not say
     (with_effect({"probability": None}), ["Probable: gain of r<0> that changes with time. With it the RMSE on held-out links falls"], []),
     (with_error(parts={"rmse_db": 3.01}), ["goes from 3.00 to 3.01 dB"], []),
     (with_error(parts={"rmse_db": 2.999}), ["stays at 3.00 dB"], []),
-    (with_error(learnable=LEARNABLE), ["100 of these links lie at a fault or a change that other flights do not show; "
+    (with_error(learnable=LEARNABLE), ["100 of these links lie at a fault or a change that only links held out with them show; "
                                        "without them it is 2.50 dB before and 2.00 dB after."], []),
     (with_step("undecided", rest_db=9.0, probabilities=[{"name": "not in the catalogue", "probability": 0.43},
                                                         {"name": "antenna_pattern", "probability": 0.34}]),

@@ -35,7 +35,8 @@ NEIGHBOURS = 9
 LEVEL_SD_DB, SLOPE_SD_DB = 20.0, 10.0  # prior sd of a level at 100 m [dB] and a slope [dB/decade]
 # Prior tolerance of devices, receivers or flights [dB], and the number of ends it counts for.
 SPREAD_DB, SPREAD_ENDS = 0.5, 4
-MAX_ENDS = 40  # more devices or receivers get no terms of their own
+MAX_ENDS = 40  # more devices, receivers, tracks or flights get no terms of their own
+MIN_STEPS = 3  # differences of successive tracks from which their median is that of a drift
 CURVE_KNOTS, NUISANCE_SD_DB = 6, 2.0  # base's error over prediction and elevation: knots, sd [dB]
 KNOTS = 8  # knots of an unnamed curve
 TIME_KNOTS = 24  # knots of one over time
@@ -328,35 +329,48 @@ class _Family:
     group: np.ndarray
     start_s: np.ndarray
 
-    @property
-    def freedom(self) -> int:
-        """Degrees of freedom of the spread, one fewer than of deviations from the groups' means."""
-        return max(len(self.group) - len(np.unique(self.group)) - 1, 0)
-
-    def usual_variance(self, level_db: np.ndarray, covariance: np.ndarray) -> float:
-        """Estimate the variance of the good ends' levels [dB²] from their levels (k,).
+    def usual_variance(self, level_db: np.ndarray, covariance: np.ndarray,
+                       seen: np.ndarray) -> tuple[float, int]:
+        """Estimate the variance of the good ends' levels [dB²], and its degrees of freedom.
 
         The smaller one of two robust estimates counts: from deviations from the group's median,
-        which a faulty flight does not widen, and from differences of successive tracks, which a
-        drift or a step does not (von Neumann 1941, 'Distribution of the ratio of the mean square
-        successive difference to the variance', Ann. Math. Stat. 12). The error of the estimates,
-        from the levels' `covariance` (k, k), is subtracted; what all levels of a group share, and
-        no link determines, cancels.
+        which a faulty flight does not widen, and from differences of successive tracks less their
+        median, which a step or a drift does not widen (von Neumann 1941, 'Distribution of the ratio
+        of the mean square successive difference to the variance', Ann. Math. Stat. 12). It is low
+        by a fifth for many tracks and by half for groups of three, as faults must stand out. The
+        error of the estimates is subtracted; what all levels of a group share, and no link
+        determines, cancels.
+
+        Args:
+            level_db: (k,) estimated levels [dB].
+            covariance: (k, k) their covariance [dB²].
+            seen: (k,) bool, ends that a link tells of. Those alone in their group tell nothing.
         """
-        if not self.freedom:
-            return 0.0
-        same = self.group[:, None] == self.group
-        ratio = len(same) / (self.freedom + 1)  # variance of levels over that of deviations
+        member, size = np.unique(np.where(seen, self.group, -1), return_inverse=True,
+                                 return_counts=True)[1:]
+        used = seen & (size[member] > 1)
+        group, start_s, level_db = self.group[used], self.start_s[used], level_db[used]
+        covariance = covariance[np.ix_(used, used)]
+        freedom = len(group) - len(np.unique(group)) - 1
+        if freedom < 1:
+            return 0.0, 0
+        same = group[:, None] == group
         centred = np.eye(len(same)) - same / same.sum(axis=1)
         medians = np.array([np.median(level_db[each]) for each in same])
+        ratio = len(same) / (freedom + 1)  # variance of levels over that of their deviations
         found = [ratio * ((MAD_SD * np.median(np.abs(level_db - medians))) ** 2
                           - np.median(np.diag(centred @ covariance @ centred.T)))]
-        order = np.lexsort((self.start_s, self.group))
-        steps = np.diff(np.eye(len(same))[order], axis=0)[np.diff(self.group[order]) == 0]
-        if np.isfinite(self.start_s).all():
-            found.append(0.5 * ((MAD_SD * np.median(np.abs(steps @ level_db))) ** 2
-                                - np.median(np.diag(steps @ covariance @ steps.T))))
-        return max(float(min(found)), 0.0)
+        steps_db, variances = [], []
+        for each in np.unique(group):
+            rows = np.flatnonzero((group == each) & np.isfinite(start_s))
+            contrast = np.diff(np.eye(len(same))[rows[np.argsort(start_s[rows])]], axis=0)
+            step_db = contrast @ level_db
+            steps_db.append(step_db - (np.median(step_db) if len(step_db) >= MIN_STEPS else 0.0))
+            variances.append(np.diag(contrast @ covariance @ contrast.T))
+        step_db, variance = np.concatenate(steps_db), np.concatenate(variances)
+        if len(step_db) >= MIN_STEPS:
+            found.append(0.5 * ((MAD_SD * np.median(np.abs(step_db))) ** 2 - np.median(variance)))
+        return max(float(min(found)), 0.0), freedom
 
 
 def _nuisance(links: Links, mean_db: np.ndarray) -> tuple[Columns, list[_Family]]:
@@ -381,7 +395,7 @@ def _nuisance(links: Links, mean_db: np.ndarray) -> tuple[Columns, list[_Family]
     by_track = len(np.unique(links.track)) <= MAX_ENDS
     in_time = links.track if by_track else links.flight
     for label in (links.device, links.receiver, in_time):
-        members, first = np.unique(label, return_index=True)
+        members, first, member = np.unique(label, return_index=True, return_inverse=True)
         if 1 < len(members) <= MAX_ENDS:
             blocks.append(one_hot(label, members.tolist()))
             columns = slice(len(prior_sd_db), len(prior_sd_db) + len(members))
@@ -389,7 +403,7 @@ def _nuisance(links: Links, mean_db: np.ndarray) -> tuple[Columns, list[_Family]
             if label is in_time and by_track:
                 group = links.receiver[first]
             if label is in_time and not links.time_restarts:
-                start_s = links.time_s[first]
+                np.fmin.at(start_s, member, links.time_s)
             families.append(_Family(columns, group, start_s))
             prior_sd_db += [SPREAD_DB] * len(members)
     return Columns(np.hstack(blocks), np.array(prior_sd_db)), families
@@ -397,7 +411,7 @@ def _nuisance(links: Links, mean_db: np.ndarray) -> tuple[Columns, list[_Family]
 
 def _with_estimated_tolerances(evidence: CorrelatedEvidence, z: np.ndarray, nuisance: Columns,
                                families: list[_Family]) -> Columns:
-    """Set the prior sd of the levels of devices, receivers and tracks to their estimated tolerance.
+    """Set the prior sds of the levels of devices, receivers, tracks or flights to their tolerance.
 
     The levels of one kind are estimated with a wide prior. If fewer than half are faulty, their
     robust spread is the tolerance of the good ones. It is shrunk to `SPREAD_DB`, fully so for two
@@ -407,10 +421,11 @@ def _with_estimated_tolerances(evidence: CorrelatedEvidence, z: np.ndarray, nuis
         prior_sd = nuisance.prior_sd.copy()
         prior_sd[family.columns] = LEVEL_SD_DB
         level_db, covariance = evidence.coefficients(z, Columns(nuisance.values, prior_sd))
-        usual = family.usual_variance(level_db[family.columns],
-                                      covariance[family.columns, family.columns])
-        spread = ((SPREAD_ENDS * SPREAD_DB**2 + family.freedom * usual)
-                  / (SPREAD_ENDS + family.freedom))
+        # The level of an end without a usable reading is as uncertain as before.
+        seen = (nuisance.values[evidence.rows, family.columns] != 0).any(axis=0)
+        usual, freedom = family.usual_variance(level_db[family.columns],
+                                               covariance[family.columns, family.columns], seen)
+        spread = (SPREAD_ENDS * SPREAD_DB**2 + freedom * usual) / (SPREAD_ENDS + freedom)
         prior_sd[family.columns] = np.sqrt(spread)
         nuisance = replace(nuisance, prior_sd=prior_sd)
     return nuisance

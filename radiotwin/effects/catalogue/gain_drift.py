@@ -148,7 +148,8 @@ class _GainDrift(GainEffect):
                 candidate for candidate in _candidates(
                     links.select(rows), view.residual_db[rows], view.weight[rows],
                     self._between_flights) if candidate[1] in self.forms)
-            # What fits best as a warm-up on each flight is no change between flights.
+            # What fits best as a warm-up on each flight is no change between flights. A receiver
+            # that has both is given the warm-up alone.
             if nats > MIN_NATS and not (self._between_flights and form == "warm_up_each_flight"):
                 # The drift must not depend on the times of the links that it is applied to.
                 keep = form == "ageing" or not self.of_receiver
