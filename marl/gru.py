@@ -41,7 +41,7 @@ def gru(x: Tensor, sizes: np.ndarray, memory: Tensor | None,
     else:
         start = x.new_zeros(int(sizes[0]), unit.hidden_size) if memory is None else memory
         hidden_states = _PackedGru.apply(x, unit.weight_ih_l0, unit.weight_hh_l0, unit.bias_ih_l0,
-                             unit.bias_hh_l0, start, sizes)
+                                         unit.bias_hh_l0, start, sizes)
     return hidden_states, hidden_states[len(hidden_states) - int(sizes[-1]):]
 
 

@@ -52,7 +52,7 @@ def twin_prior(twin: Twin, scene: Scene, radio_map: RadioMap, rng: np.random.Gen
         device_m[rows[some]] = drawn_m[number, some]
         predicted = twin.predict(links.with_devices(device_m))
         mean_db, candidate_sd_db = (values.reshape(len(some), *shape[2:])
-                              for values in (predicted.mean_db, predicted.sd_db))
+                                    for values in (predicted.mean_db, predicted.sd_db))
         snr_db[some, number] = mean_db + offset_db[some, None, None, None]
         sd_db[some, number] = candidate_sd_db
     weight = np.where(moves[:, None], 1.0 / count, np.arange(count) == 0)

@@ -134,7 +134,7 @@ class Executor:
         return results
 
     def _run_in_process(self, job: Job, todo: "deque[_Todo]", cache: Cache,
-                  advance: Callable[..., None], patience_s: float) -> None:
+                        advance: Callable[..., None], patience_s: float) -> None:
         """Run pieces of `todo` in this process, and remove them, until it would take too long.
 
         That is if the time so far, or the extrapolated time of the pieces left (by the mean of all
@@ -154,7 +154,7 @@ class Executor:
             advance(job.size(one.piece))
 
     def _run_on_workers(self, job: Job, todo: "deque[_Todo]", cache: Cache,
-                   advance: Callable[..., None]) -> bool:
+                        advance: Callable[..., None]) -> bool:
         """Run all pieces of `todo` on workers; return False, and run none, if the pool has none."""
         assert self._pool is not None
         workers = self._pool.prepare(_pickled(job), job.resources, len(todo))
