@@ -375,7 +375,7 @@ class CrossFit:
 
     @cached_property
     def learnable(self) -> np.ndarray:
-        """(n,) bool, links that other links tell: no fault or change lies between them."""
+        """(n,) bool, links that can be predicted from others: no fault or change lies between."""
         found = ~self.not_learnable
         for number, fold in enumerate(self.folds):
             for effect in self.whole.effects:

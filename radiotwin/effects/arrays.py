@@ -12,7 +12,7 @@ from radiotwin.scene.citymap import CityMap
 
 NEPERS = np.log(10) / 10  # natural logarithm of power per decibel
 MIN_POWER = 1e-290  # smallest argument of a logarithm
-MIN_LINKS = 60  # links that must tell of an effect; effects that need others have their own number
+MIN_LINKS = 60  # least number of links to search for an effect, unless it has its own
 MIN_NATS = 5.0  # gain of the log-likelihood, by a quick estimate, above which effects are proposed
 
 

@@ -281,10 +281,10 @@ class Effect(ABC):
         return None
 
     def untold(self, links: Links, train: np.ndarray) -> np.ndarray:
-        """Return (n,) bool, links whose levels no training link tells, though it shows the effect.
+        """Return (n,) bool, links whose levels cannot be predicted from the training links.
 
         A receiver that changed between two flights is an example: if the last flight before the
-        change is held out, no link tells when it changed. By default none.
+        change is held out, the time of the change is not known there. By default none.
 
         Args:
             links: n links.

@@ -92,7 +92,7 @@ def _has_ground_below(surfaces: Surfaces) -> bool:
 def check_units(surfaces: Surfaces) -> list[Problem]:
     """Return an error if a city is wider than 100 km, a warning if it seems not to be in metres.
 
-    Only parts with walls tell. It looks like kilometres if none is 1 m tall and the city narrower
+    Only parts with walls count. It looks like kilometres if none is 1 m tall and the city narrower
     than 100 m; like feet, centimetres or millimetres if half of them are taller than
     `MAX_MEDIAN_M`.
     """

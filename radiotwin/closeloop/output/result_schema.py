@@ -38,7 +38,7 @@ class ErrorRecord(BothRecord):
     map: ScoresRecord | None = None
     after_same_links: ScoresRecord | None = None  # on the links of `before` only
     after_with_quality: ScoresRecord | None = None
-    learnable: BothRecord | None = None  # without links that no other tells
+    learnable: BothRecord | None = None  # without links that others cannot predict
     noise_floor_db: Real | None
     by_los: dict[Literal["los", "nlos"], BothRecord] = Field(default_factory=dict)
     by_device: dict[str, BothRecord] = Field(default_factory=dict)

@@ -344,7 +344,7 @@ class _Family:
         Args:
             level_db: (k,) estimated levels [dB].
             covariance: (k, k) their covariance [dB²].
-            seen: (k,) bool, ends that a link tells of. Those alone in their group tell nothing.
+            seen: (k,) bool, ends with a usable reading. Those alone in their group do not count.
         """
         member, size = np.unique(np.where(seen, self.group, -1), return_inverse=True,
                                  return_counts=True)[1:]

@@ -96,7 +96,7 @@ class _GainDrift(GainEffect):
 
     @override
     def untold(self, links: Links, train: np.ndarray) -> np.ndarray:
-        """Return (n,) bool, links between which and the step, or warm-up, none is learnt from.
+        """Return (n,) bool, links with no training link between them and the step or warm-up.
 
         A warm-up counts as a change at its time constant, when two thirds of it are over.
         """

@@ -1,6 +1,6 @@
 """Power and directions of the propagation paths of links over the 3D map, computed once and cached.
 
-`KnownPaths` stores the paths of links and tells which of them a box, such as an unknown building,
+`KnownPaths` stores the paths of links and finds which of them a box, such as an unknown building,
 blocks. It has no reflections at the box. The caller adds knife-edge diffraction at the box, for the
 straight line only.
 """

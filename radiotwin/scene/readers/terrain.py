@@ -115,8 +115,8 @@ def approximate(grid: HeightGrid, tolerance_m: float, max_faces: int) -> GroundM
             triangulation, of the border, may have more.
 
     Returns:
-        Triangles whose corners are nodes of the grid; they cover its rectangle without gaps. Their
-        largest and RMS vertical distance from the nodes are told.
+        Triangles whose corners are nodes of the grid, and their largest and RMS vertical distance
+        from the nodes. They cover the grid's rectangle without gaps.
     """
     height_m = np.asarray(grid.height_m, dtype=float)
     rows, columns = np.indices(height_m.shape)
